@@ -172,7 +172,7 @@ class ModelPolicy:
         self._state = self._state if same else None
 
     def __call__(self, rows: np.ndarray) -> np.ndarray:
-        """Return the most likely actions."""
+        """Return the most likely actions (rows, A) for observations (rows, D)."""
         if len(rows) != len(self._begins):
             self.reset(np.ones(len(rows), dtype=bool))
         if self._normaliser is not None:

@@ -284,7 +284,7 @@ class Gates:
             self._before = {car: state.rejections for car, state in self._states.items()}
 
     def fresh_states(self, patience: float = STATUS_TIME) -> dict[str, GateState]:
-        """Return a status of each gate that came within s from now. Raises CoopenvError: a gate is silent."""
+        """Return a status of each gate, waiting `patience` s for new ones. Raises CoopenvError: a gate is silent."""
         asked, known = time.monotonic(), {car: counts.copy() for car, counts in self.dropped.items()}
         while any(state.received < asked for state in self.states.values()) and time.monotonic() < asked + patience:
             time.sleep(POLL)

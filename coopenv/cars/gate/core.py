@@ -203,7 +203,7 @@ class Gate:
         """What the next arming has to name."""
         self._session, self._sequence, self._accepted = "", -1, 0
         self._wanted: MotionCommand | None = None  # by the last valid command, while it counts
-        self._set = 0
+        self._offset = 0
         """Wall clock less the steady one at the last arming, ns: a clock that is set later makes no command fresh."""
         self.commanded = self._ticked = clock.steady()
         """When the last valid command came, steady clock, ns."""
@@ -285,7 +285,7 @@ class Gate:
             raise Rejected(Reason.MALFORMED)
         if int(digits) <= self._sequence:
             raise Rejected(Reason.SEQUENCE)
-        ages = self._clock.wall() - stamp, self._clock.steady() + self._set - stamp
+        ages = self._clock.wall() - stamp, self._clock.steady() + self._offset - stamp
         self._check(Role.COMMAND, ages, payload, attachment)
         if not all(map(math.isfinite, numbers)):
             self._come_to_a_stand(GateMode.TIMED_OUT)  # the station itself has lost its way
@@ -310,7 +310,7 @@ class Gate:
             raise Rejected(Reason.SESSION)
         if session != self._session:  # one that is armed again goes on counting: nothing of it comes twice
             self._session, self._sequence = session, -1
-        self._set = self._clock.wall() - self._clock.steady()
+        self._offset = self._clock.wall() - self._clock.steady()
         self._come_to_a_stand(GateMode.ARMED)
 
     def _stop(self, payload: bytes, _attachment: bytes) -> None:

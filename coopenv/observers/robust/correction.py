@@ -96,7 +96,11 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, projecti
 
 @subroutine
 def gate_jointly(memory: Any, world: int, i: int, bearings: int):
-    """Reject, one by one, the bearing without which the others fit best, until each fits given the earlier ones."""
+    """Reject, one by one, the bearing without which the others fit best, until each fits given the earlier ones.
+
+    Source: Parkinson and Axelrad, Autonomous GPS integrity monitoring using the pseudorange residual, Navigation 35(2),
+    1988, for the exclusion by the residuals of subsets.
+    """
     most, total = correct_by_bearings(memory, world, i, bearings, False)
     while most > wp.float64(constants.BEARING_GATE):
         least = wp.float64(wp.inf)
