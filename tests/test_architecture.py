@@ -94,7 +94,7 @@ LINES_AND_FILES = {
     "cli": (2630, 8),
     "estimation": (1865, 8),
     "evaluation": (495, 3),
-    "observers": (11730, 47),
+    "observers": (11735, 47),
     "policies": (2075, 10),
     "runs": (3500, 13),
     "scenario": (3770, 13),
