@@ -90,11 +90,13 @@ class Route(Section):
         """Straight lines and arcs from its beginning to its end."""
         length, heading, turn, cut = vars(self.shape).values()
         points, ahead, radius = np.array(self.waypoints), _direction(heading), self.corner_radius
-        lines = points[:-1] + cut[:-1, None] * ahead, heading, 0.0 * heading, length - cut[:-1] - cut[1:]
-        curvature = np.copysign(1.0 / radius if radius else 0.0, turn[1:])
-        arcs = points[1:] - cut[1:, None] * ahead, heading, curvature, radius * np.abs(turn[1:])
-        there = np.stack([lines[3] > 1e-9, cut[1:] > 0.0], axis=1)
-        return Pieces(*(np.stack(pair, axis=1)[there] for pair in zip(lines, arcs, strict=True)))
+        rows = np.zeros((len(length), 2, 5))  # a line, then the arc at its end
+        rows[:, 0, :2], rows[:, 0, 4] = points[:-1] + cut[:-1, None] * ahead, length - cut[:-1] - cut[1:]
+        rows[:, 1, :2], rows[:, 1, 4] = points[1:] - cut[1:, None] * ahead, radius * np.abs(turn[1:])
+        rows[:, :, 2] = heading[:, None]
+        rows[:, 1, 3] = np.copysign(1.0 / radius if radius else 0.0, turn[1:])
+        there = np.column_stack([rows[:, 0, 4] > 1e-9, cut[1:] > 0.0])
+        return Pieces(rows[there, :2], *rows[there, 2:].T)
 
     @cached_property
     def start_corners(self) -> tuple[np.ndarray, np.ndarray]:

@@ -199,7 +199,7 @@ class Scenario(Section, metaclass=_Loaded):
     @property
     def cosimulator(self) -> Cosimulator | None:
         """Section of the program that moves the vehicles; None: coopenv moves them."""
-        return getattr(self, self.backend, None)
+        return None if self.backend == "simulated" else getattr(self, self.backend)
 
     @property
     def ticks_per_decision(self) -> int:
@@ -255,7 +255,7 @@ def _misplaced(s: Scenario) -> Iterator[str]:
 
 
 def _moved_elsewhere(vehicle: Vehicle, title: str) -> Iterator[str]:
-    kind, speed = vehicle.motion.kind, getattr(vehicle.motion, "initial_speed", 0.0)
+    kind, speed = vehicle.motion.kind, dict(vehicle.motion).get("initial_speed", 0.0)
     if kind not in ("driven", "traffic"):
         yield f"motion.kind: '{kind}' is not known to {title}; known: driven, traffic"
     drawn = {"initial_pose": vehicle.initial_pose, "motion.initial_speed": speed, "entry": vehicle.entry}

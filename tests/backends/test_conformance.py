@@ -157,7 +157,12 @@ def test_masks_and_ages_mean_the_same(make: Make) -> None:
         env.reset(seed=5)
         ever_seen, ever_heard, steps = False, False, 0
         known, errors = env.engine.backend.capabilities.truth, dict[str, float]()
-        while env.agents and (steps < 25 or not (ever_heard and ever_seen)) and steps < 55:
+
+        def settled() -> bool:
+            """Whether all that is looked for was there, which takes longer where a busy computer took frames."""
+            return steps > 15 and ever_heard and ever_seen and all(error < 0.2 for error in errors.values())
+
+        while env.agents and not settled() and steps < 55:
             observations, rewards, _, _, infos = env.step(dict.fromkeys(env.agents, AHEAD))
             steps += 1
             for agent, seen in observations.items():
@@ -169,9 +174,8 @@ def test_masks_and_ages_mean_the_same(make: Make) -> None:
                 if np.isfinite(error := infos[agent]["position_error"]):
                     errors[agent] = error
             ever_heard |= bool(observations.get("vehicle_2", {"message_mask": np.zeros(1)})["message_mask"].any())
-        assert steps > 15 and ever_seen and ever_heard
         assert sorted(errors) == (env.possible_agents if known else [])
-        assert all(error < 0.2 for error in errors.values()), errors
+        assert settled(), errors
     finally:
         env.close()
 
