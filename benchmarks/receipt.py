@@ -43,7 +43,14 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
     """Return what leaves out each part of the observer: attributes of modules, and what replaces them."""
     import warp as wp
 
-    from coopenv.observers.robust import constants, correlated_fusion, fault_hypotheses, measurements, observer
+    from coopenv.observers.robust import (
+        constants,
+        correction,
+        correlated_fusion,
+        fault_hypotheses,
+        measurements,
+        observer,
+    )
     from coopenv.observers.robust.memory import SENDER_SLOTS
     from coopenv.observers.robust.source_monitor import end_block
     from coopenv.observers.robust.sources import take_slot
@@ -77,8 +84,13 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
     def no_increment(memory: Any, world: int, i: int, n: int, d: Any):  # type: ignore[no-untyped-def]
         pass
 
+    @device_function
+    def no_gate(memory: Any, world: int, i: int, bearings: int):  # type: ignore[no-untyped-def]
+        correction.correct_by_bearings(memory, world, i, bearings, False)
+
     return {
         "nothing": [],
+        "gate of bearings": [(correction, "gate_jointly", no_gate)],
         "all monitors": [(constants, "FAULT_GATE", 1e30)],
         "monitors of the own sensors": [(constants, "OWN_FAULT", 1e-9)],
         "monitors of landmarks": [(measurements, "take_slot", no_landmark)],

@@ -92,15 +92,15 @@ LINES_AND_FILES = {
     "bench": (5360, 19),
     "cars": (10765, 47),
     "cli": (2630, 8),
-    "estimation": (1865, 8),
+    "estimation": (1881, 8),
     "evaluation": (495, 3),
     "observers": (11735, 47),
     "policies": (2075, 10),
     "runs": (3500, 13),
     "scenario": (3770, 13),
     "training": (1750, 7),
-    "viz": (4820, 19),
-    "world": (5570, 20),
+    "viz": (4832, 19),
+    "world": (5582, 20),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

@@ -132,7 +132,8 @@ class Info(TypedDict):
     orientation_error: float
     """deg, geodesic angle."""
     nees: float
-    """Normalised error squared in the coordinates of P; 6 in the mean for a consistent estimate."""
+    """Normalised error squared in the coordinates in which the observer states P; in the mean its degrees of freedom
+    (6, on a plane 3) for a consistent estimate."""
     log_determinant: float
     """Of P."""
     position_std: float

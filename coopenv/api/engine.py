@@ -24,7 +24,7 @@ from coopenv.backends.tick_world import open_world
 from coopenv.base.columns import facts_html, one_line, picture_html
 from coopenv.base.errors import CoopenvError, Explained, check_memory, error_text, training_seed, world_keys
 from coopenv.base.installation import load_reference
-from coopenv.estimation.poses import riccati_covariance
+from coopenv.estimation.poses import Coordinates, riccati_covariance
 from coopenv.observers.contract import Estimate
 from coopenv.observers.group import ObserverError, ObserverGroup
 from coopenv.observers.mailbox import Interference, interference_of
@@ -501,6 +501,7 @@ class PlugIns:
         view("estimate_rotation")[w, vehicle] = R
         view("estimate_position")[w, vehicle] = R.T @ np.asarray(estimate.position, dtype=float)
         if estimate.covariance is not None:
+            self._world.model.of_paper = int(estimate.coordinates is Coordinates.RICCATI)
             view("covariance")[w, vehicle] = riccati_covariance(
                 estimate.coordinates, estimate.rotation, estimate.position, estimate.covariance
             )

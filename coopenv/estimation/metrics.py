@@ -236,6 +236,7 @@ def summarise(trajectory: Trajectory, steady_from: float, ends: Sequence[float] 
                 "steady_position_rmse_m": float(steady_rmse(t, position, steady_from)),
                 "steady_orientation_rmse_deg": float(steady_rmse(t, orientation, steady_from)),
                 "mean_targets_in_view": float(mean_targets_in_view(trajectory.visible[:ticks, vehicle])),
+                "nees_dof": trajectory.nees_dof,
                 "mean_nees": float(steady_mean(t, trajectory.nees[:ticks, vehicle], steady_from)),
                 "final_position_error_m": float(position[-1]),
                 "final_orientation_error_deg": float(orientation[-1]),

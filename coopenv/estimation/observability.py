@@ -40,7 +40,7 @@ from coopenv.base.columns import Columns, Tabular, facts_html, one_line
 from coopenv.base.errors import DataError, check_one_of
 from coopenv.base.files import replacing_file
 from coopenv.base.format import read_npz
-from coopenv.estimation.poses import Array, position_covariance, roll_pitch_yaw_deg, skew
+from coopenv.estimation.poses import Array, error_dof, position_covariance, roll_pitch_yaw_deg, skew
 
 DEFAULT_WINDOW = 1.0
 DEFAULT_THRESHOLD = 1e-4
@@ -84,7 +84,7 @@ class Trajectory(RecordedGeometry, Tabular):
     position_error: Annotated[np.ndarray, "f K N"]  # m
     orientation_error: Annotated[np.ndarray, "f K N"]  # deg, geodesic
     covariance: Annotated[np.ndarray, "f K N 6 6"]  # rad^2, rad m, m^2
-    nees: Annotated[np.ndarray, "f K N"]  # e^T P^-1 e
+    nees: Annotated[np.ndarray, "f K N"]  # e^T P^-1 e, e and P in the coordinates in which the observer states P
     protection_level: Annotated[np.ndarray, "f? K N 2"]  # m, rad; infinite: unknown, or none is stated
     velocity: Annotated[np.ndarray, "f K N 3"]  # m/s, truth
     angular_velocity: Annotated[np.ndarray, "f K N 3"]  # rad/s, truth
@@ -93,6 +93,11 @@ class Trajectory(RecordedGeometry, Tabular):
     terms: Annotated[np.ndarray, "U R"]  # names of the terms
     targets: Annotated[np.ndarray, "U T"]  # names
     target_moving: Annotated[np.ndarray, "b T"]  # vehicles and moving landmarks
+
+    @property
+    def nees_dof(self) -> int:
+        """Degrees of freedom of `nees`: 6, or 3 where no error leaves a plane, as of robots with planar estimates."""
+        return error_dof(self.rotation, self.position, self.rotation_estimate, self.position_estimate)
 
     def columns(self) -> Columns:
         """Return a row per tick and vehicle; `_std_` are of the position in the map frame, from P to first order."""

@@ -180,6 +180,16 @@ def orientation_error_deg(rotation: np.ndarray, rotation_estimate: np.ndarray) -
     return np.asarray(np.degrees(2 * np.arctan2(np.linalg.norm(q[..., 1:], axis=-1), q[..., 0])))
 
 
+def error_dof(rotation: Array, position: Array, rotation_estimate: Array, position_estimate: Array) -> int:
+    """Return the degrees of freedom of the errors of poses (..., 3, 3) and (..., 3): 6, or 3 if none leaves a plane.
+
+    So are those of robots whose estimates are planar. Poses that are NaN do not count.
+    """
+    tilt = np.abs(np.asarray(rotation_estimate)[..., 2, :] - np.asarray(rotation)[..., 2, :]).max(axis=-1)
+    height = np.abs(np.asarray(position_estimate)[..., 2] - np.asarray(position)[..., 2])
+    return 3 if np.fmax.reduce(np.fmax(tilt, height), axis=None) < 1e-6 else 6
+
+
 def roll_pitch_yaw_deg(rotation: np.ndarray) -> np.ndarray:
     """Return (..., 3) roll, pitch, yaw in degrees with R = Rz(yaw) Ry(pitch) Rx(roll)."""
     R = np.asarray(rotation, float)

@@ -317,7 +317,7 @@ class Results(Tabular):
             yield f"{note}; all of them: {METRICS_FILE}"
         yield ""
         yield from rates(vehicles)
-        yield from legend(self.steady_from, end)
+        yield from legend(self.steady_from, end, self.trajectory.nees_dof)
         yield from remarks(vehicles)
 
     @property

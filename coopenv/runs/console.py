@@ -215,11 +215,11 @@ def rates(vehicles: list[dict[str, Any]]) -> Iterator[Table | str]:
     yield ""
 
 
-def legend(steady_from: float, end: float) -> Iterator[str]:
+def legend(steady_from: float, end: float, nees_dof: int) -> Iterator[str]:
     """Yield what the columns mean, for a steady state that starts at a time and a run that ends at one, s."""
     yield f"Settles: stays below {SETTLED.text}. Converges: stays below {CONVERGED.text}."
     if steady_from < end:
-        yield f"RMSE and NEES: steady state, after {steady_from:g} s. NEES of a consistent estimate: 6."
+        yield f"RMSE and NEES: steady state, after {steady_from:g} s. NEES of a consistent estimate: {nees_dof}."
     else:
         yield f"No steady state: it would begin at {steady_from:g} s (see --steady-from)."
 

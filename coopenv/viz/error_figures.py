@@ -9,18 +9,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
-from scipy.stats import chi2
 
 from coopenv.estimation.metrics import (
     CONVERGED,
     STEADY_SHARE,
     live_ticks,
+    mean_bounds,
     observability_of,
     settling_times,
     steady_mean,
 )
 from coopenv.estimation.observability import Observability, Trajectory
-from coopenv.estimation.poses import error_rotation, roll_pitch_yaw_deg
+from coopenv.estimation.poses import error_rotation, position_covariance, roll_pitch_yaw_deg
 from coopenv.viz import style
 
 if TYPE_CHECKING:
@@ -155,17 +155,13 @@ def _share_scale(column: Sequence[Axes], components: Sequence[np.ndarray], toler
         ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "\N{MINUS SIGN}")))
 
 
-DEGREES_OF_FREEDOM = 6
-NEES_BOUNDS = (float(chi2.ppf(0.025, DEGREES_OF_FREEDOM)), float(chi2.ppf(0.975, DEGREES_OF_FREEDOM)))
-"""95 % of the NEES of a consistent observer lie between these, at one instant over many runs."""
-
 _NEES_ROW, _NEES_NARROW_ROW, _NEES_FRAME = 1.3, 0.95, 1.2  # inches
 _EXPECTED: dict[str, Any] = {"color": style.GREY, "linewidth": 0.8, "linestyle": (0, (4, 2))}
 _STEADY: dict[str, Any] = {"color": style.INK, "linewidth": 0.7, "linestyle": (0, (1, 1.5))}
 _CLAIMED: dict[str, Any] = {"color": style.VERMILION, "linestyle": (0, (4, 1.5)), "linewidth": 1.4}
 _ERROR: dict[str, Any] = {"color": style.INK, "linestyle": "-", "linewidth": 0.8}
 _SHORT = 9.0  # inches: in narrower figures panels have no room for sentences
-_TITLES = ("NEES (6 dof), log", "position [m], log", "orientation [deg], log")
+_TITLES = ("NEES, log", "position [m], log", "orientation [deg], log")
 _NARROW_TITLES = ("NEES, log", "[m], log", "[deg], log")
 _ROOM = 0.3  # of the height, for words above the curves
 CONSISTENT = (
@@ -202,21 +198,22 @@ def consistency_figure(
     narrow, short = (width is not None and width < limit for limit in (style.NARROW, _SHORT))
     figure, _ = style.canvas(width, _NEES_FRAME + (_NEES_NARROW_ROW if narrow else _NEES_ROW) * count)
     axes = figure.subplots(count, 3, squeeze=False)
-    variance = np.diagonal(np.asarray(trajectory.covariance, float), axis1=-2, axis2=-1)
-    with np.errstate(invalid="ignore"):  # of an observer that has diverged
-        spread = np.sqrt(variance.reshape(-1, count, 2, 3).sum(axis=-1))
+    P, dof = np.asarray(trajectory.covariance, float), trajectory.nees_dof
+    with np.errstate(over="ignore", invalid="ignore"):  # of an observer that has diverged
+        of_position = position_covariance(trajectory.rotation_estimate, trajectory.position_estimate, P)
+        stds = [np.sqrt(np.trace(block, axis1=-2, axis2=-1)) for block in (of_position, P[..., :3, :3])]
     live = live_ticks(trajectory.t, count, ends)
     for vehicle, (left, middle, right) in enumerate(axes):
         t, part = trajectory.t[: live[vehicle]], (slice(live[vehicle]), vehicle)
-        _draw_nees(left, t, trajectory.nees[part], steady_from, short)
-        _draw_spread(middle, t, trajectory.position_error[part], spread[part][:, 1])
-        _draw_spread(right, t, trajectory.orientation_error[part], np.degrees(spread[part][:, 0]))
+        _draw_nees(left, t, trajectory.nees[part], dof, steady_from, short)
+        _draw_spread(middle, t, trajectory.position_error[part], stds[0][part])
+        _draw_spread(right, t, trajectory.orientation_error[part], np.degrees(stds[1][part]))
     _finish(axes, trajectory, live, _NARROW_TITLES if narrow else _TITLES)
     for column, room in zip(axes.T, (_ROOM, 0.0, 0.0), strict=True):
         style.share_decades(column, room)
     style.explain(figure, GAIN if gain else CONSISTENT)
     marks = style.marks(
-        (True, "95 % of $\\chi^2_6$", {"facecolor": style.SHADE}),
+        (True, f"95 % of $\\chi^2_{dof}$", {"facecolor": style.SHADE}),
         (True, "expected", _EXPECTED),
         (trajectory.t[0] < steady_from < trajectory.t[-1], "steady state", _STEADY),
         (True, "error", _ERROR),
@@ -227,9 +224,15 @@ def consistency_figure(
     return figure
 
 
-def _draw_nees(ax: Axes, t: np.ndarray, nees: np.ndarray, steady_from: float, short: bool) -> None:
-    ax.axhspan(*NEES_BOUNDS, color=style.SHADE, zorder=0)
-    ax.axhline(DEGREES_OF_FREEDOM, **_EXPECTED)
+def nees_bounds(dof: int) -> tuple[float, float]:
+    """Return between which 95 % of the NEES of a consistent observer lie, at one instant over many runs."""
+    low, high = mean_bounds(dof)
+    return dof * low, dof * high
+
+
+def _draw_nees(ax: Axes, t: np.ndarray, nees: np.ndarray, dof: int, steady_from: float, short: bool) -> None:
+    ax.axhspan(*nees_bounds(dof), color=style.SHADE, zorder=0)
+    ax.axhline(dof, **_EXPECTED)
     ax.set_yscale("log")
     shown = style.drawable(nees, positive=True)
     if np.isnan(shown).all():
@@ -238,18 +241,19 @@ def _draw_nees(ax: Axes, t: np.ndarray, nees: np.ndarray, steady_from: float, sh
         return
     keep = style.thinned(len(t))
     ax.plot(t[keep], shown[keep], color=style.INK, linewidth=0.7)
-    words = _verdict(t, nees, steady_from, short)
+    words = _verdict(t, nees, dof, steady_from, short)
     style.note(ax, 0.985, 0.95, words, ha="right", va="top", path_effects=style.HALO)
     if t[0] < steady_from < t[-1]:
         ax.axvline(steady_from, **_STEADY)
 
 
-def _verdict(t: np.ndarray, nees: np.ndarray, steady_from: float, short: bool) -> str:
+def _verdict(t: np.ndarray, nees: np.ndarray, dof: int, steady_from: float, short: bool) -> str:
     """Return the mean NEES that the table of the run has, too."""
     steady = nees[t > steady_from]
     if not len(steady):
         return "ended before" if short else f"ended before the steady state ({steady_from:.4g} s)"
-    inside = np.mean((steady >= NEES_BOUNDS[0]) & (steady <= NEES_BOUNDS[1]))
+    low, high = nees_bounds(dof)
+    inside = np.mean((steady >= low) & (steady <= high))
     mean = float(steady_mean(t, nees, steady_from))
     if short:
         return f"mean {mean:.3g}"

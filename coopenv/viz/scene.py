@@ -67,7 +67,7 @@ class Frame:
     position_covariance: Annotated[np.ndarray, "f K N 3 3"]  # m^2, from the observer's P to first order
     position_error: Annotated[np.ndarray, "f K N"]  # m
     orientation_error: Annotated[np.ndarray, "f K N"]  # deg
-    nees: Annotated[np.ndarray, "f K N"]  # normalised error squared of the pose; 6 on average where P is consistent
+    nees: Annotated[np.ndarray, "f K N"]  # normalised error squared of the pose, see `Info`
     protection_level: Annotated[np.ndarray, "f? K N 2"]  # m and rad, see `Step`
     sight: Annotated[np.ndarray, "i K N A"]  # values of `Sight`
     pan: Annotated[np.ndarray, "f K N"]  # rad, by which the camera is turned to the left

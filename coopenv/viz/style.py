@@ -52,6 +52,7 @@ NARROW = 5.0  # inches: narrower figures are for one column of a journal
 _LEGEND_MARK, _LEGEND_LETTER = 0.45, 0.06  # inches
 _LEAST_DECADES, _LEAST_LABELS = 1.05, 2  # on a logarithmic axis
 _LARGEST = 1e100  # of a value that is drawn
+_ROUNDING = 1e-9  # below it errors, m or deg, are those of arithmetic
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -165,10 +166,10 @@ def bins_of(inches: float) -> int:
 
 
 def drawable(values: np.ndarray, *, positive: bool = False) -> np.ndarray:
-    """Return values with NaN in place of what an axis cannot show: infinite, huge, on a logarithmic one zero."""
+    """Return values with NaN in place of what an axis cannot show: infinite, huge, on a logarithmic one rounding."""
     values = np.asarray(values, float)
     with np.errstate(invalid="ignore"):
-        return np.where((np.abs(values) < _LARGEST) & ((values > 1 / _LARGEST) | (not positive)), values, np.nan)
+        return np.where((np.abs(values) < _LARGEST) & ((values > _ROUNDING) | (not positive)), values, np.nan)
 
 
 def runs(t: np.ndarray, mask: np.ndarray, gap: float = 0.0) -> list[tuple[float, float]]:

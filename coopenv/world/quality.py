@@ -35,11 +35,21 @@ def normalised_error_squared(I11: Any, L21: Any, I22: Any, e1: Any, e2: Any):
 
 
 @wp.func
-def observer_error(R: Any, position: Any, R_hat: Any, p_hat: Any):
-    """Return (2 lambda, p - phat), the error coordinates of P: Rtilde = Rhat^T R, p = R^T pbar (paper, sec. IV)."""
-    R_tilde = wp.transpose(R_hat) * R
-    lam = quaternion_vector(R_tilde)
-    return lam * p_hat.dtype(2.0), wp.transpose(R) * position - p_hat
+def observer_error(R: Any, position: Any, R_hat: Any, p_hat: Any, of_paper: bool):
+    """Return the error that P is about: (2 lambda, p - phat), Rtilde = Rhat^T R, p = R^T pbar (paper, sec. IV).
+
+    An observer that states its covariance in other coordinates knows nothing of terms of second order of these, which
+    grow with the distance from the map's origin. Its error (theta, rho), R = Rhat Exp(theta), pbar = Rhat (phat + rho),
+    is brought to them as its covariance is, see `coopenv.estimation.poses.riccati_covariance`.
+    """
+    lam = quaternion_vector(wp.transpose(R_hat) * R)
+    e1 = lam * p_hat.dtype(2.0)
+    if of_paper:
+        return e1, wp.transpose(R) * position - p_hat
+    sine = wp.length(lam)
+    if sine > p_hat.dtype(1e-4):
+        e1 *= wp.asin(wp.min(sine, p_hat.dtype(1.0))) / sine
+    return e1, wp.transpose(R_hat) * position - p_hat + wp.cross(p_hat, e1)
 
 
 @wp.func

@@ -9,7 +9,7 @@ import warp as wp
 
 from coopenv.base.errors import CoopenvError, check_memory
 from coopenv.estimation.outcomes import UNKNOWN, Sight
-from coopenv.estimation.poses import Rule
+from coopenv.estimation.poses import Coordinates, Rule
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.build import build_model
@@ -110,6 +110,7 @@ class World:
         self.threads = max(shares, lanes) if self.device == "cpu" else 1
         self.observer = observer if observer.fit is None else observer.fit(self.model)
         """What estimates in the kernels; `HOST` where estimates are written from outside, see `PlugIns`."""
+        self.model.of_paper = int(self.observer.coordinates is Coordinates.RICCATI)
         self.in_parts = self.device != "cpu" and len(self.observer.parts) > 1
         """Whether the observer's parts are kernels of their own; on the CPU that would only load a world's state more
         often."""

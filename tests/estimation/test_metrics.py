@@ -233,7 +233,7 @@ def test_windows_beyond_the_end_do_not_count() -> None:
 def test_summary_of_the_synthetic_run() -> None:
     rows = metrics.summarise(make_trajectory(), steady_from=40.0)
     assert [row["vehicle"] for row in rows] == [f"vehicle_{i}" for i in range(1, 6)]
-    assert all(isinstance(value, str | float | bool | None) for row in rows for value in row.values())
+    assert all(isinstance(value, str | float | bool | int | None) for row in rows for value in row.values())
     for row, initial, rate in zip(rows, np.linalg.norm(INITIAL_ERROR, axis=-1), RATE, strict=True):
         assert row["initial_position_error_m"] == pytest.approx(initial)
         assert row["initial_orientation_error_deg"] == pytest.approx(90.0)

@@ -218,7 +218,7 @@ def test_the_table_has_a_row_per_vehicle_and_a_legend() -> None:
     assert table.row_count == len(vehicles)
     assert [str(column.header).split()[0] for column in table.columns][3:5] == ["settles", "converges"]
     assert not any("-" in str(column.header) for column in table.columns)
-    assert [*legend(5.0, 20.0)] == [
+    assert [*legend(5.0, 20.0, 6)] == [
         "Settles: stays below 0.5 m and 5 deg. Converges: stays below 0.1 m and 1 deg.",
         "RMSE and NEES: steady state, after 5 s. NEES of a consistent estimate: 6.",
     ]

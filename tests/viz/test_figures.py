@@ -147,9 +147,10 @@ def test_what_is_so_all_the_time_is_not_shaded_and_a_run_that_does_not_settle_sa
     assert not any(text.startswith("last above 0.1 m") for text in texts(figure))
 
 
-def test_nees_bounds_are_the_central_95_percent_of_six_dof() -> None:
-    draws = chi2(6).rvs(200_000, random_state=np.random.default_rng(0))
-    low, high = error_figures.NEES_BOUNDS
+@pytest.mark.parametrize("dof", [3, 6])
+def test_nees_bounds_are_the_central_95_percent(dof: int) -> None:
+    draws = chi2(dof).rvs(200_000, random_state=np.random.default_rng(0))
+    low, high = error_figures.nees_bounds(dof)
     assert np.mean(draws < low) == pytest.approx(0.025, abs=0.002)
     assert np.mean(draws > high) == pytest.approx(0.025, abs=0.002)
 
@@ -161,9 +162,11 @@ def test_consistency_shows_the_share_of_ticks_inside_and_the_claimed_deviation(r
     assert sum("75 % of ticks inside" in text for text in texts(figure)) == 1  # equal notes, one set member
     claimed, error = figure.axes[1].lines
     assert ydata(error)[0] == pytest.approx(run.position_error[0, 0])
-    assert ydata(claimed)[0] == pytest.approx(np.sqrt(3) * (6 + 0.02 + 1e-3))
+    deviation, turn = 6 + 0.02 + 1e-3, 1 + np.radians(0.02) + 1e-4  # per axis
+    lever = np.linalg.norm(run.position_estimate[0, 0])  # from the map's origin: P is about R^T p
+    assert ydata(claimed)[0] == pytest.approx(np.sqrt(3 * deviation**2 + 2 * (lever * turn) ** 2))
     degrees = ydata(figure.axes[2].lines[0])[0]
-    assert degrees == pytest.approx(np.degrees(np.sqrt(3) * (1 + np.radians(0.02) + 1e-4)))
+    assert degrees == pytest.approx(np.degrees(np.sqrt(3) * turn))
 
 
 def test_mean_nees_is_the_one_of_the_table(run: Trajectory) -> None:

@@ -133,13 +133,25 @@ def log_determinant(P: Any):
 def judged(P: Any, R: Any, position: Any, R_hat: Any, p_hat: Any):
     """Return the observer's error coordinates and the NEES."""
     I11, L21, I22 = quality.cholesky_of(P)
-    e1, e2 = quality.observer_error(R, position, R_hat, p_hat)
+    e1, e2 = quality.observer_error(R, position, R_hat, p_hat, True)
     return e1, e2, quality.normalised_error_squared(I11, L21, I22, e1, e2)
+
+
+@wp.func
+def nees_of_left(P: Any, R: Any, position: Any, R_hat: Any, p_hat: Any):
+    I11, L21, I22 = quality.cholesky_of(P)
+    e1, e2 = quality.observer_error(R, position, R_hat, p_hat, False)
+    return quality.normalised_error_squared(I11, L21, I22, e1, e2)
 
 
 of_quality = Calls(
     __name__,
-    {log_determinant: "66 > 1", judged: "66 33 3 33 3 > 3 3 1", quality.position_variance: "66 3 > 1"},
+    {
+        log_determinant: "66 > 1",
+        judged: "66 33 3 33 3 > 3 3 1",
+        nees_of_left: "66 33 3 33 3 > 1",
+        quality.position_variance: "66 3 > 1",
+    },
 )
 
 
@@ -185,6 +197,20 @@ def test_error_coordinates_and_nees(angle: float | None) -> None:
     expected = poses.Coordinates.RICCATI.error(R, position, R_hat, estimate)
     assert_allclose(np.concatenate([e1, e2], axis=1), expected, atol=1e-13)
     assert_allclose(value, metrics.nees(expected, P), rtol=1e-8)
+
+
+@pytest.mark.parametrize("away", [0.0, 1e3])
+@pytest.mark.parametrize("angle", [None, 1e-9, 1e-3, np.pi - 1e-6])
+def test_nees_of_other_coordinates_is_that_of_the_observer_anywhere(angle: float | None, away: float) -> None:
+    """Although the covariance is kept in the paper's, as far as their first order goes."""
+    R, position, R_hat, p_hat = drawn_poses(1, angle)
+    position = position + away
+    estimate = np.einsum("nij,nj->ni", R_hat, p_hat) + away
+    P = covariances(np.random.default_rng(2))
+    kept = [poses.riccati_covariance(poses.Coordinates.LEFT, *row) for row in zip(R_hat, estimate, P, strict=True)]
+    expected = metrics.nees(poses.Coordinates.LEFT.error(R, position, R_hat, estimate), P)
+    arguments = np.array(kept), R, position, R_hat, np.einsum("nji,nj->ni", R_hat, estimate)
+    assert_allclose(of_quality(nees_of_left, "float64", *arguments), expected, rtol=0.01 if away else 2e-6)
 
 
 def test_nees_by_hand() -> None:

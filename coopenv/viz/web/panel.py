@@ -9,8 +9,9 @@ import numpy as np
 
 from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Sight
+from coopenv.estimation.poses import error_dof
 from coopenv.viz.camera_image import camera_image
-from coopenv.viz.error_figures import NEES_BOUNDS
+from coopenv.viz.error_figures import nees_bounds
 from coopenv.viz.scene import Frame, Origin, semi_axes
 from coopenv.viz.stage import Stage, vehicle_mark
 from coopenv.viz.style import BLUE, DARK_BLUE, GREY, INK, VEHICLE_COLOURS, VERMILION, vehicle_colour
@@ -69,7 +70,13 @@ class Plots:
         # Observers that state no level have a curve as well: it lies on that of 3 sigma.
         level = np.minimum(level, UNKNOWN_LEVEL) if np.isfinite(level).any() else sigma
         self._error.data = (time, *map(_positive, (error, sigma, level)))
-        self._nees.data = (time, _positive(nees), *(np.full(len(time), bound) for bound in NEES_BOUNDS))
+        agent = vehicle - len(frames[0].nees)
+        truth, estimate = (
+            [np.array([getattr(frame, name)[agent] for frame in frames]) for name in names]
+            for names in (("rotation", "position"), ("estimate_rotation", "estimate_position"))
+        )
+        bounds = nees_bounds(error_dof(*truth, *estimate))
+        self._nees.data = (time, _positive(nees), *(np.full(len(time), bound) for bound in bounds))
         if self._terms:
             terms = np.nan_to_num([frame.terms[vehicle, : self._terms] for frame in frames])
             self._reward.data = (time, *np.ascontiguousarray(terms.T))
