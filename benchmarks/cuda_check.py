@@ -26,8 +26,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.api.engine import Engine
-from coopenv.backends.cosimulation_kernels import COSIMULATED
-from coopenv.backends.feed import RECORDED
+from coopenv.backends.feed import COSIMULATED, RECORDED
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
 from coopenv.base.format import json_text

@@ -25,8 +25,7 @@ from coopenv.estimation.poses import Array
 from coopenv.observers import run
 from coopenv.observers.recording import Recording
 from coopenv.runs import record
-from coopenv.scenario import Scenario, load_scenario
-from coopenv.scenario.files import parse_scenario
+from coopenv.scenario import Scenario, load_scenario, parse_scenario
 
 OBSERVERS = ("riccati", "schmidt_kalman", "robust")
 """In the parametric scenes."""

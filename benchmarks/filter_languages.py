@@ -13,7 +13,7 @@ from coopenv.estimation.poses import Array, exp_so3, lengths, orthonormalise, ri
 from coopenv.observers import bearing_measurements
 from coopenv.observers.bearing_measurements import Frame
 from coopenv.observers.correction import Stacked
-from coopenv.observers.error_state_filters import Mekf
+from coopenv.observers.pose_filters import Mekf
 from coopenv.observers.recording import Recording
 from coopenv.observers.runner import Run, run
 from coopenv.runs.recorder import record

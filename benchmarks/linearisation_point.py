@@ -56,7 +56,7 @@ def patch(share: float, time: float) -> None:
 def measure(point: str, time: float, worlds: int) -> dict[str, list[float]]:
     """Return per scene the range bias, m, its standard error, ANEES of the second vehicle and its standard error."""
     patch(POINTS[point], time)
-    from coopenv.backends.simulated import Simulated
+    from coopenv.backends.worlds import Simulated
     from coopenv.estimation.metrics import nees
     from coopenv.estimation.poses import Coordinates
     from coopenv.scenario import load_scenario

@@ -25,7 +25,7 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.sources import open_simulation
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers.rows import standard_error
-from coopenv.estimation.outcomes import Outcome
+from coopenv.estimation import Outcome
 from coopenv.evaluation import Episodes, drive, held_out_seeds
 from coopenv.evaluation.metrics import SETTLED_FROM
 from coopenv.policies import Policy, load_agent

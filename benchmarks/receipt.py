@@ -51,8 +51,8 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
         measurements,
         observer,
     )
+    from coopenv.observers.robust.integrity import end_block
     from coopenv.observers.robust.memory import SENDER_SLOTS
-    from coopenv.observers.robust.source_monitor import end_block
     from coopenv.observers.robust.sources import take_slot
     from coopenv.world.warp_internals import device_function
 

@@ -16,7 +16,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.runs.live import EngineReel
 from coopenv.runs.scenes import driver_of, open_source
 from coopenv.runs.view import Viewer
-from coopenv.viz.web.page import guarded_server
+from coopenv.viz.web import guarded_server
 
 WARM_UP = 2.0  # s
 RATE = 20.0  # frames/s, to which shares are scaled

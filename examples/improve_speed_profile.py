@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import coopenv
-from coopenv.observers.riccati.gradient import DifferentiableWorld
+from coopenv.observers.riccati_gradient import DifferentiableWorld
 
 overrides = {
     "noise.enabled": False,

@@ -63,9 +63,8 @@ def _where(entry: ZooEntry) -> str:
 
 def _page(name: str, entry: ZooEntry, about: str, sends: str) -> str:
     place, _, item = entry.plugin.partition(":")
-    file = f"coopenv/observers/{place.replace('.', '/')}.py"
-    package = file.rpartition("/")[0] + "/__init__.py"
-    doc = _docstring(package if place.endswith("kernels") else file)
+    module = f"coopenv/observers/{place.replace('.', '/')}"
+    file = f"{module}.py" if (ROOT / f"{module}.py").exists() else f"{module}/__init__.py"
     facts = [
         f"Sends: {sends}.",
         f"Source: `{file}`.",
@@ -84,7 +83,7 @@ def _page(name: str, entry: ZooEntry, about: str, sends: str) -> str:
                 about[0].upper() + about[1:] + ".",
                 bullets(facts),
                 "## Method and source",
-                doc.replace("*", r"\*").replace("<", "&lt;"),
+                _docstring(file).replace("*", r"\*").replace("<", "&lt;"),
                 *([f"[More]({MORE[name]})."] if name in MORE else []),
                 *shown,
                 "## Code",

@@ -15,7 +15,7 @@ import numpy as np
 
 import coopenv
 from coopenv.api.engine import Engine
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 from coopenv.observers.registry import states_covariance
 from coopenv.runs.scenes import scene_of
 from coopenv.viz.scene import Origin, SceneRecord, semi_axes

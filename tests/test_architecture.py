@@ -86,23 +86,24 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 LINES_AND_FILES = {
     ".": (123, 2),
-    "api": (4165, 19),
-    "backends": (3840, 20),
-    "base": (1820, 10),
-    "bench": (5360, 19),
-    "cars": (10765, 47),
+    "api": (4311, 19),
+    "backends": (3820, 16),
+    "base": (1875, 10),
+    "bench": (5345, 18),
+    "cars": (10750, 39),
     "cli": (2630, 8),
-    "estimation": (1881, 8),
+    "estimation": (1881, 7),
     "evaluation": (495, 3),
-    "observers": (11735, 47),
+    "observers": (11720, 42),
     "policies": (2075, 10),
     "runs": (3500, 13),
-    "scenario": (3770, 13),
-    "training": (1750, 7),
-    "viz": (4832, 19),
-    "world": (5582, 20),
+    "scenario": (3705, 12),
+    "training": (1600, 6),
+    "viz": (4830, 16),
+    "world": (5582, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
+MOST_FILES = 240
 
 
 def test_wings_keep_their_budgets() -> None:
@@ -114,6 +115,7 @@ def test_wings_keep_their_budgets() -> None:
         count[1] += 1
     above = {wing: count for wing, count in counts.items() if not _within(wing, count)}
     assert not above, f"lines and files of wings above their budgets: {above}"
+    assert len(MODULES) <= MOST_FILES
 
 
 def _within(wing: str, count: list[int]) -> bool:

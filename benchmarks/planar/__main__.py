@@ -15,7 +15,7 @@ from benchmarks.planar.lies import Drifting, Replaying
 from coopenv.backends.mrclam import VARIANTS, Dataset, load_dataset, recording_of
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Array
-from coopenv.observers.planar.plugin import LEAST_LOST_STD, PlanarEkf, PlanarRobust
+from coopenv.observers.planar import LEAST_LOST_STD, PlanarEkf, PlanarRobust
 from coopenv.observers.recording import Recording
 from coopenv.observers.runner import Run, run
 from tests.helpers.mrclam_files import barrier_robots, carried_off

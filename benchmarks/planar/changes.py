@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from coopenv.backends.mrclam.dataset import Dataset, MotionCapture, Robot
+from coopenv.backends.mrclam_dataset import Dataset, MotionCapture, Robot
 from coopenv.estimation.poses import Array
 
 LANDMARKS_FROM = 6  # subjects below that are robots

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.observers.registry import find_embedded
-from coopenv.observers.riccati.kernels import DEAD_RECKONING
+from coopenv.observers.riccati import DEAD_RECKONING
 from coopenv.observers.runner import start_covariances
 from coopenv.scenario import load_scenario
 from coopenv.world.dynamics import move, referee

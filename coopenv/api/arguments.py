@@ -6,7 +6,7 @@ from typing import Any, NotRequired, TypedDict
 import numpy as np
 
 from coopenv.base.errors import ActionError, CoopenvError, check_one_of, error_text, shown, suggest
-from coopenv.estimation.outcomes import Outcome, Sight
+from coopenv.estimation import Outcome, Sight
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import LEVELS, PARAMETERS
 from coopenv.world.reset import ABSENT

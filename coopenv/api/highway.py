@@ -15,7 +15,7 @@ from coopenv.api.engine import Engine
 from coopenv.backends.cosimulation import Cosimulated, Moment, Poses, TrafficProgram
 from coopenv.backends.highway import flipped, poses_of
 from coopenv.base.errors import CoopenvError, checked_seed
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array, position_covariance
 from coopenv.scenario import Scenario, load_scenario
 

@@ -10,15 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.cosimulation_kernels import COSIMULATED, cosimulation_struct
-from coopenv.backends.simulated import Simulated, SimulatedWorld
+from coopenv.backends.feed import COSIMULATED, cosimulation_struct
+from coopenv.backends.worlds import Simulated, SimulatedWorld
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.installation import blamed, load_reference
 from coopenv.estimation.poses import Array, about_z
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Road
-from coopenv.world.dynamics import SPEED, STEERING, UNDER_WAY
+from coopenv.world.dynamics import SPEED, STEERING
 from coopenv.world.launch import PerWorld
+from coopenv.world.route import UNDER_WAY
 from coopenv.world.state import allocate, fields
 
 

@@ -16,7 +16,7 @@ from coopenv.base.installation import list_envs
 
 if TYPE_CHECKING:
     from coopenv.backends.base import Backend
-    from coopenv.backends.simulated import Simulated
+    from coopenv.backends.worlds import Simulated
     from coopenv.cars.bags import Bag
     from coopenv.observers.recording import Recording
     from coopenv.scenario import Scenario, ScenarioLike
@@ -104,9 +104,8 @@ def open_recording(name: str | Path, data: str | Path | None = None, variant: st
         raise DataError(f"{name}: a ROS bag; make a recording of it with: {IMPORT.format(name)}")
     if kind is not SourceKind.DATASET:
         raise DataError(f"'{name}' is no recording; known: FILE{LOG_SUFFIX}, mrclam_1 .. mrclam_9")
-    from coopenv.backends.mrclam import load_dataset, recording_of
-    from coopenv.backends.mrclam.dataset import IN_SPACE
-    from coopenv.backends.mrclam.recording import check_variant
+    from coopenv.backends.mrclam import check_variant, load_dataset, recording_of
+    from coopenv.backends.mrclam_dataset import IN_SPACE
 
     chosen = check_variant(variant or "landmarks+robots")  # before much is read
     in_space = str(name).endswith(IN_SPACE)
@@ -136,7 +135,7 @@ def simulation_of(scenario: Scenario) -> Simulated:
         from coopenv.backends.cosimulation import Cosimulated
 
         return Cosimulated(scenario)
-    from coopenv.backends.simulated import Simulated
+    from coopenv.backends.worlds import Simulated
 
     return Simulated(scenario)
 
@@ -212,7 +211,7 @@ def _open_recorded(name: str, overrides: Mapping[str, Any], data: str | Path | N
 
         if is_drive(name):
             return Drive(name, overrides)
-    from coopenv.backends.replay import Replay
+    from coopenv.backends.worlds import Replay
 
     return Replay(open_recording(name, data, variant), Path(name).name, overrides)
 

@@ -12,9 +12,6 @@ from pydantic_core import to_json, to_jsonable_python
 
 from coopenv.base.errors import CoopenvError, DataError, error_text
 
-LARGEST = 1e9
-"""Largest magnitude of any quantity, in its own unit: products of four such numbers still fit into single precision."""
-
 NONE = "-"
 MOST_DECIMALS = 5
 FINEST_ERROR = 1e-3  # share of its number below which a standard error is not given by its first digit

@@ -1,7 +1,8 @@
-"""TOML files from outside in typed sections, checked, each with an error of one line."""
+"""TOML files from outside in typed sections, checked, each with an error of one line; the types of their quantities."""
 
 import ast
 import inspect
+import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -11,9 +12,9 @@ from functools import cache, reduce
 from itertools import pairwise
 from pathlib import Path
 from textwrap import dedent
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed, shortened, shown, suggest
 
@@ -94,7 +95,19 @@ def _entry(node: Any, key: str) -> Any:
     return named[key]
 
 
+P = TypeVar("P", bound=Section)
 Model = TypeVar("Model", bound=BaseModel)
+
+
+def overlaid(base: P, part: P | None) -> P:
+    """Return a section with what another one gives in place of its own entries; tables within are overlaid likewise."""
+    if part is None:
+        return base
+    changes = {}
+    for name in part.model_fields_set:
+        own, given = getattr(base, name), getattr(part, name)
+        changes[name] = overlaid(own, given) if isinstance(own, Section) and isinstance(given, Section) else given
+    return base.model_copy(update=changes)
 
 
 def read_toml(path: Path, error: type[CoopenvError] = CoopenvError, where: str | None = None) -> dict[str, Any]:
@@ -231,3 +244,45 @@ def _models_in(annotation: Any) -> list[Any]:
     if isinstance(annotation, type):
         return [annotation] if issubclass(annotation, BaseModel) else []
     return [model for inner in getattr(annotation, "__args__", ()) for model in _models_in(inner)]
+
+
+def _unit_quaternion(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    norm = math.sqrt(sum(x * x for x in q))
+    if abs(norm - 1.0) > 1e-3:
+        raise ValueError(f"a rotation needs a unit quaternion, this one has norm {norm:.4g}")
+    return (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
+
+
+def _points_somewhere(direction: tuple[float, float, float]) -> tuple[float, float, float]:
+    if sum(x * x for x in direction) < 1e-12:
+        raise ValueError("must not be zero")
+    return direction
+
+
+def _readable(text: str) -> str:
+    for line in text.splitlines():
+        if not line.replace("\t", " ").isprintable():
+            raise ValueError(f"control characters are not allowed, got {shown(line)}")
+    return text
+
+
+LARGEST = 1e9
+"""Largest magnitude of any quantity, in its own unit: products of four such numbers still fit into single precision."""
+
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Vector2 = tuple[Number, Number]
+Vector3 = tuple[Number, Number, Number]
+Direction = Annotated[Vector3, AfterValidator(_points_somewhere)]
+QuaternionWxyz = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_unit_quaternion)]
+Positive = Annotated[float, Field(gt=0.0, le=LARGEST)]
+NonNegative = Annotated[float, Field(ge=0.0, le=LARGEST)]
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+Loss = Annotated[float, Field(ge=0.0, lt=1.0)]
+Rate = Annotated[float, Field(ge=1e-3, le=1e5)]
+PositiveVector2 = tuple[Positive, Positive]
+PositiveVector3 = tuple[Positive, Positive, Positive]
+NonNegativeVector3 = tuple[NonNegative, NonNegative, NonNegative]
+Sample = Literal["sample"]
+Word = Annotated[str, AfterValidator(_readable)]
+Text = Annotated[str, Field(max_length=10_000), AfterValidator(_readable)]
+"""Printed as it is, so that nothing in it may command a terminal."""

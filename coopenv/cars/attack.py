@@ -17,11 +17,11 @@ from coopenv.base.errors import CoopenvError, listed
 from coopenv.cars.backend.station import OLD, OPEN, PATIENCE, Gates
 from coopenv.cars.codec import decode, encode, header, make, ros2
 from coopenv.cars.deployment import Deployment
-from coopenv.cars.gate.core import ENCAPSULATION, Reason, write_drive
+from coopenv.cars.gate import ENCAPSULATION, Reason, write_drive
 from coopenv.cars.keys import Signer, library, load_verifier
 from coopenv.cars.profile import GATE_TYPES, VELOCITY, MotionCommand, Role
 from coopenv.cars.readings import Twist, read
-from coopenv.cars.transport.base import Arrival
+from coopenv.cars.transport import Arrival
 from coopenv.cars.transport.zenoh import Zenoh, certificates_of, open_zenoh
 
 MOVES = 0.1  # m/s, above the noise of the wheels

@@ -10,8 +10,8 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
 from coopenv.base.sections import Section, read_toml, validated, with_tables
-from coopenv.cars.fake.faults import USUAL as DEFAULT_FAKE
-from coopenv.cars.fake.faults import FakeSettings
+from coopenv.cars.fake import USUAL as DEFAULT_FAKE
+from coopenv.cars.fake import FakeSettings
 from coopenv.cars.profile import (
     SVEA,
     USUAL,
@@ -25,7 +25,7 @@ from coopenv.cars.profile import (
     is_simple,
     load_profile,
 )
-from coopenv.cars.transport.base import SECURE, UNIX, Tls, address_of
+from coopenv.cars.transport import SECURE, UNIX, Tls, address_of
 
 Endpoint = Annotated[str, AfterValidator(lambda text: address_of(text) and text)]  # such as tcp/127.0.0.1:7447
 

@@ -15,7 +15,7 @@ from coopenv.cars.profile import GATE_TYPES, CarProfile, MotionCommand, Role, Vi
 from coopenv.cars.vision import BEARINGS, FINDERS, UNIT, Calibration, Tag
 from coopenv.estimation.poses import Array, log_so3
 from coopenv.observers.contract import Message
-from coopenv.scenario import base
+from coopenv.scenario import sensing
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +102,7 @@ def rotation_of(quaternion: Any, field: str) -> Array:
     length = math.hypot(*wxyz)
     if not abs(length - 1.0) <= UNIT:
         raise CoopenvError(f"{field}: no unit quaternion, its length is {length:.6g}")
-    return base.rotation_of(None, wxyz)
+    return sensing.rotation_of(None, wxyz)
 
 
 MOST = 1000

@@ -11,7 +11,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import decode, encode, header, make, stamp_of
 from coopenv.cars.profile import CarProfile, Role
 from coopenv.cars.readings import Detections, read
-from coopenv.cars.transport.base import Arrival, Transport
+from coopenv.cars.transport import Arrival, Transport
 from coopenv.cars.vision import Calibration
 
 SILENT = 2.0  # s without a frame that are worth a line

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from coopenv.cars.bags.log import TopicRow
-    from coopenv.cars.calibration.findings import Row
+    from coopenv.cars.calibration import Row
 
 
 def import_(
@@ -45,7 +45,7 @@ def import_(
                 f"{'--out' if out else '--override'}: needs the map of the bags' topics, --map topics.toml"
             )
         from coopenv.base.files import check_new, replace_text
-        from coopenv.cars.bags.doctor import examined, proposed
+        from coopenv.cars.bags import examined, proposed
         from coopenv.cars.bags.files import BagFile
 
         if propose is not None:
@@ -129,9 +129,9 @@ def calibrate(
     """Estimate cameras, odometry, clocks and markers of cars from one drive, and print which constants are wrong."""
     from coopenv.backends.sources import SourceKind, kind_of, open_bags, open_recording
     from coopenv.base.files import check_file, new_folder, replace_text
+    from coopenv.cars.calibration import calibrate as calibrated
+    from coopenv.cars.calibration import toml_text
     from coopenv.cars.calibration.drives import drive_of_bag, drive_of_recording
-    from coopenv.cars.calibration.findings import calibrate as calibrated
-    from coopenv.cars.calibration.findings import toml_text
     from coopenv.runs.console import Progress
     from coopenv.viz.error_figures import residual_figure
     from coopenv.viz.style import save

@@ -19,7 +19,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cli import options
 
 if TYPE_CHECKING:
-    from coopenv.cars.transport.base import Transport
+    from coopenv.cars.transport import Transport
 
 svea = options.group("SVEA cars, real ones and fakes.")
 HARMED = 1
@@ -91,7 +91,7 @@ def fake(
     """Let a fake car drive, see and send until it is interrupted; a line marks when it is ready."""
     from coopenv.base import interrupts
     from coopenv.cars.deployment import load_deployment
-    from coopenv.cars.fake.faults import fake_fault
+    from coopenv.cars.fake import fake_fault
     from coopenv.cars.fake.fleet import prepare_fake, run
     from coopenv.cars.transport.zenoh import open_transport
 
@@ -143,7 +143,7 @@ def gate(
     Limits beyond those of the make are refused: for SVEA 1.53 m/s, 0.5236 rad, 2 m/s^2 and 4 rad/s.
     """
     from coopenv.base import interrupts
-    from coopenv.cars.gate.process import CLOCK, gate_deployment, prepare_gate, run
+    from coopenv.cars.gate_process import CLOCK, gate_deployment, prepare_gate, run
     from coopenv.cars.transport.zenoh import open_transport
 
     bounds = {"speed": max_speed, "steering": max_steering, "acceleration": max_acceleration}
@@ -178,10 +178,10 @@ def health(
     """
     from coopenv.cars.backend.station import BYPASSED, UNTRIED, Gates, neutral_command
     from coopenv.cars.deployment import load_deployment
-    from coopenv.cars.gate.core import Reason
-    from coopenv.cars.gate.process import gate_deployment
+    from coopenv.cars.gate import Reason
+    from coopenv.cars.gate_process import gate_deployment
     from coopenv.cars.keys import load_verifier
-    from coopenv.cars.transport.base import UNIX, LinkError
+    from coopenv.cars.transport import UNIX, LinkError
     from coopenv.cars.transport.zenoh import open_transport
 
     fleet = gate_deployment(car, deployment, connect, off_board)
@@ -219,7 +219,7 @@ def health(
 def next_message(transport: "Transport", topic: str, kind: str, patience: float) -> Any | None:
     """Return the next message of a topic that is of a type (None: none within s); whatever else comes is dropped."""
     from coopenv.cars.codec import decode
-    from coopenv.cars.transport.base import Arrival
+    from coopenv.cars.transport import Arrival
 
     heard = Queue[Any](1)
 
@@ -247,7 +247,7 @@ def see(
     messages of other detectors are read as well.
     """
     from coopenv.base import interrupts
-    from coopenv.cars.gate.process import gate_deployment
+    from coopenv.cars.gate_process import gate_deployment
     from coopenv.cars.profile import Role
     from coopenv.cars.readings import read
     from coopenv.cars.see import FrameReader

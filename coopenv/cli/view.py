@@ -263,7 +263,7 @@ def view(given: ViewOptions) -> None:
     from coopenv.runs.console import compile_notice
     from coopenv.runs.live import vehicle_index
     from coopenv.runs.view import Viewer
-    from coopenv.viz.web.page import guarded_server, viser_module
+    from coopenv.viz.web import guarded_server, viser_module
 
     viser_module()
     log = options.console(stderr=True)

@@ -17,7 +17,7 @@ from scipy.linalg.lapack import dgesv, dpotrf
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import CoopenvError, explained
-from coopenv.base.format import LARGEST
+from coopenv.base.sections import LARGEST
 
 Array = NDArray[np.float64]
 

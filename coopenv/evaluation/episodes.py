@@ -8,7 +8,7 @@ import numpy as np
 
 from coopenv.api.engine import Engine
 from coopenv.base.errors import evaluation_seed, world_keys
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 from coopenv.policies import Policy, decide, restart
 from coopenv.scenario import Scenario
 

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coopenv.estimation import Outcome
 from coopenv.estimation.metrics import LEVEL, Interval, wilson_interval
-from coopenv.estimation.outcomes import Outcome
 from coopenv.evaluation.episodes import Episodes
 
 RESAMPLES = 2000

@@ -1,7 +1,7 @@
 """Extended Kalman filter over the stacked left errors of all vehicles: the upper reference.
 
 Source: Roumeliotis and Bekey, Distributed multirobot localization, IEEE Transactions on Robotics and Automation 18(5),
-2002, in its centralised form; errors and Jacobians as in error_state_filters.py. A bearing from i to a point z_j = p_j
+2002, in its centralised form; errors and Jacobians as in pose_filters.py. A bearing from i to a point z_j = p_j
 + R_j m_j of vehicle j also has H_j = B Rhat_i^T Rhat_j [-S(m_j), I] / |d|. Each vehicle has a gate; corrections are
 linearised half way (correction.py).
 

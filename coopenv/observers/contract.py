@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf
 
 from coopenv.base.errors import CoopenvError, shown
-from coopenv.base.format import LARGEST
+from coopenv.base.sections import LARGEST
 from coopenv.estimation.poses import MAX_BEND, MOST_LOPSIDED, Array, Coordinates, are_rotations
 
 BYTES_PER_NUMBER = 8

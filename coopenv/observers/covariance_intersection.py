@@ -42,7 +42,7 @@ from coopenv.observers.bearing_measurements import (
 )
 from coopenv.observers.contract import Tick
 from coopenv.observers.correction import joseph, own_gain, updated
-from coopenv.observers.error_state_filters import Mekf
+from coopenv.observers.pose_filters import Mekf
 
 LOWEST, HIGHEST = 0.02, 1.0 - 1e-6  # limits of w; 1 leaves the measurement out
 CLOSE = 1e-9  # to which w is found

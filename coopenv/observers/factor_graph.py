@@ -19,7 +19,7 @@ from coopenv.estimation.poses import Array
 from coopenv.observers.bearing_measurements import LEFT, UncertainPose, linearised, usable_bearings
 from coopenv.observers.contract import Estimate, Setup, Tick
 from coopenv.observers.correction import InnovationGate
-from coopenv.observers.error_state_filters import PoseObserver, unit
+from coopenv.observers.pose_filters import PoseObserver, unit
 
 LAG = 1.0  # s
 KEY_PERIOD = 0.1  # s between key frames

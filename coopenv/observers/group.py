@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coopenv.base.errors import CoopenvError, error_text, shown
-from coopenv.estimation.outcomes import UNKNOWN
+from coopenv.estimation import UNKNOWN
 from coopenv.estimation.poses import Array, Coordinates
 from coopenv.observers.contract import (
     Estimate,

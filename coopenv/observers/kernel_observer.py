@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array, Coordinates, left_covariance
 from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick, check_message
 from coopenv.world.embedded import Embedded, Messages

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.outcomes import REPLAY
+from coopenv.estimation import REPLAY
 from coopenv.estimation.poses import Array, exp_so3
 from coopenv.observers.contract import Message, ObserverInit, Received, check_message, check_received, sealed
 from coopenv.scenario import Scenario

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coopenv.base.errors import CoopenvError, DataError, shown
-from coopenv.base.format import LARGEST
+from coopenv.base.sections import LARGEST
 from coopenv.estimation.poses import (
     Array,
     Fields,

@@ -40,26 +40,26 @@ class ZooEntry:
 
 
 ZOO = {
-    "dead_reckoning": ZooEntry("single_frame:DeadReckoning", "riccati.kernels:DEAD_RECKONING"),
+    "dead_reckoning": ZooEntry("pose_filters:DeadReckoning", "riccati:DEAD_RECKONING"),
     # on a plane, bearings to three points overdetermine the pose
-    "p3p": ZooEntry("single_frame:PerspectivePoints", on_a_plane=False),
-    "riccati": ZooEntry("riccati.kernels:riccati", "riccati.kernels:RICCATI", covariance=False),
-    "hamel_samson": ZooEntry("error_state_filters:HamelSamson", covariance=False),
-    "mekf": ZooEntry("error_state_filters:Mekf"),
-    "mekf_covariance": ZooEntry("error_state_filters:MekfCovariance"),
-    "mekf_covariance_ungated": ZooEntry("error_state_filters:MekfCovarianceUngated"),
+    "p3p": ZooEntry("pose_filters:PerspectivePoints", on_a_plane=False),
+    "riccati": ZooEntry("riccati:riccati", "riccati:RICCATI", covariance=False),
+    "hamel_samson": ZooEntry("pose_filters:HamelSamson", covariance=False),
+    "mekf": ZooEntry("pose_filters:Mekf"),
+    "mekf_covariance": ZooEntry("pose_filters:MekfCovariance"),
+    "mekf_covariance_ungated": ZooEntry("pose_filters:MekfCovarianceUngated"),
     "covariance_intersection": ZooEntry("covariance_intersection:CovarianceIntersection"),
     "split_covariance_intersection": ZooEntry("covariance_intersection:SplitCovarianceIntersection"),
     "pairwise": ZooEntry("schmidt_kalman:Pairwise"),
     "schmidt_kalman": ZooEntry("schmidt_kalman:SchmidtKalman"),
-    "iterated_ekf": ZooEntry("error_state_filters:IteratedEkf"),
-    "left_invariant": ZooEntry("error_state_filters:LeftInvariant"),
-    "right_invariant": ZooEntry("error_state_filters:RightInvariant"),
+    "iterated_ekf": ZooEntry("pose_filters:IteratedEkf"),
+    "left_invariant": ZooEntry("pose_filters:LeftInvariant"),
+    "right_invariant": ZooEntry("pose_filters:RightInvariant"),
     "distributed_invariant": ZooEntry("covariance_intersection:DistributedInvariant"),
-    "ukf": ZooEntry("error_state_filters:Ukf"),
+    "ukf": ZooEntry("pose_filters:Ukf"),
     "factor_graph": ZooEntry("factor_graph:FactorGraph", needs="gtsam"),
-    "planar_ekf": ZooEntry("planar.plugin:PlanarEkf", in_space=False),
-    "planar_robust": ZooEntry("planar.plugin:PlanarRobust", in_space=False),
+    "planar_ekf": ZooEntry("planar:PlanarEkf", in_space=False),
+    "planar_robust": ZooEntry("planar:PlanarRobust", in_space=False),
     "robust": ZooEntry("robust.observer:robust", "robust.observer:ROBUST", on_a_plane=False),
     "centralised": ZooEntry("centralised:Centralised"),
     "first_estimates_ekf": ZooEntry("centralised:FirstEstimatesEkf"),
@@ -190,7 +190,8 @@ def description(name: str) -> str:
 def _docstring(place: str) -> str | None:
     """Return the docstring of a class or function of this package from the source: loading it may take seconds."""
     module, _, name = place.partition(":")
-    source = (Path(__file__).parent / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8")
+    spec = find_spec(f"coopenv.observers.{module}")
+    source = Path(str(spec and spec.origin)).read_text(encoding="utf-8")
     kinds = ast.ClassDef | ast.FunctionDef
     [found] = [node for node in ast.parse(source).body if isinstance(node, kinds) and node.name == name]
     return ast.get_docstring(found)

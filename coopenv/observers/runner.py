@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from coopenv.estimation import UNIFORM_ROTATION
 from coopenv.estimation.metrics import nees as normalised_error
-from coopenv.estimation.outcomes import UNIFORM_ROTATION
 from coopenv.estimation.poses import Array, Coordinates, orientation_error_deg
 from coopenv.observers.contract import Factory, Gains, ObserverInit, SensorNoise, Setup
 from coopenv.observers.group import ObserverError, ObserverGroup, Tamper, TimedEstimate

@@ -42,7 +42,7 @@ from coopenv.observers.bearing_measurements import (
 )
 from coopenv.observers.contract import Message, Setup, Tick
 from coopenv.observers.correction import PLACES, halfway_gain, joseph
-from coopenv.observers.error_state_filters import Mekf
+from coopenv.observers.pose_filters import Mekf
 
 IDENTITY = np.eye(6)
 MOST_LOST = 60  # lost messages in a row that a received factor may stand for

@@ -25,7 +25,7 @@ from coopenv.base.installation import data_directory, is_reference, versions
 from coopenv.base.sections import Section, validated
 from coopenv.observers.registry import named, portable
 from coopenv.runs.rollouts import Rollout
-from coopenv.scenario.files import load_scenario, parse_scenario
+from coopenv.scenario import load_scenario, parse_scenario
 from coopenv.scenario.own_terms import located
 from coopenv.world.warp_internals import kernel_hashes
 

@@ -16,7 +16,7 @@ from coopenv.base.installation import install_command
 from coopenv.viz.scene import Frame, SceneRecord
 
 if TYPE_CHECKING:  # imports Matplotlib, which is only needed where there is a film
-    from coopenv.viz.film3d import View3d
+    from coopenv.viz.perspective import View3d
     from coopenv.viz.stage import Stage
     from coopenv.viz.topview import TopView
 
@@ -118,7 +118,7 @@ def space_film(
     Raises:
         CoopenvError: no such camera, or the extra is missing.
     """
-    from coopenv.viz.film3d import View3d
+    from coopenv.viz.perspective import View3d
 
     each = width // len(takes)
     size = each, each * 9 // 16 if len(takes) == 1 else each * 3 // 4

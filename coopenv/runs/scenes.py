@@ -190,7 +190,7 @@ def write_page(record: SceneRecord, path: Path, log: Console, others: Mapping[st
     """
     if not pages_can_be_written(path, log):
         return None
-    from coopenv.viz.web.page import write_replay
+    from coopenv.viz.web import write_replay
 
     with Progress(log, f"writing {path.name}", total=1.0) as progress:
         return write_replay(record, path, progress.update, others)

@@ -12,7 +12,7 @@ from coopenv.runs.live import FAULTS, Reel
 from coopenv.runs.scenes import MAX_FPS
 from coopenv.viz.scene import Frame
 from coopenv.viz.stage import Stage, entries
-from coopenv.viz.web.page import aim
+from coopenv.viz.web import aim
 from coopenv.viz.web.panel import LONGEST, NO_FAULT, Panel
 from coopenv.viz.web.picture import Picture, first_look
 

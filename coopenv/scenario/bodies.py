@@ -7,8 +7,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import Field, field_serializer, field_validator, model_validator
 
-from coopenv.base.sections import Section
-from coopenv.scenario.base import (
+from coopenv.base.sections import (
     NonNegative,
     NonNegativeVector3,
     Number,
@@ -17,6 +16,7 @@ from coopenv.scenario.base import (
     PositiveVector3,
     Probability,
     QuaternionWxyz,
+    Section,
     Vector2,
     Vector3,
     Word,

@@ -21,8 +21,7 @@ import numpy as np
 from pydantic import Field
 
 from coopenv.base.errors import ScenarioError, shown
-from coopenv.base.sections import Section
-from coopenv.scenario.base import NonNegative, Number, Positive, Word
+from coopenv.base.sections import NonNegative, Number, Positive, Section, Word
 
 Setting = bool | int | Number | Word | tuple[Number, ...] | None
 File = Annotated[str, Field(min_length=1, max_length=1_000)]

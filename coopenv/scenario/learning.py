@@ -7,8 +7,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, ConfigDict, Field, create_model, model_validator
 
 from coopenv.base.errors import listed, suggest
-from coopenv.base.sections import Section
-from coopenv.scenario.base import NonNegative, Number, Positive, Probability
+from coopenv.base.sections import NonNegative, Number, Positive, Probability, Section
 from coopenv.scenario.terms import (
     GROUPS,
     OBSERVATION_FIELDS,

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from coopenv.base.sections import Section
-from coopenv.scenario.base import NonNegative, Positive, Vector2, rotation_of
+from coopenv.base.sections import NonNegative, Positive, Section, Vector2
 from coopenv.scenario.bodies import ConstantMotion, Landmark, SegmentMotion, Vehicle, WaypointMotion
+from coopenv.scenario.sensing import rotation_of
 
 SPACING = 0.25  # m between the points of a route that is not straight ...
 MOST_POINTS = 64  # ... and how many there are at most

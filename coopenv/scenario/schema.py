@@ -12,13 +12,12 @@ from pydantic import Field, field_validator, model_validator
 
 from coopenv.base.columns import facts_html, one_line
 from coopenv.base.errors import ScenarioError, ScenarioWarning, check_one_of, listed, shown, suggest
-from coopenv.base.sections import Section, validated
-from coopenv.scenario.base import Positive, Text, Vector3, overlaid, rotation_of
+from coopenv.base.sections import Positive, Section, Text, Vector3, overlaid, validated
 from coopenv.scenario.bodies import Landmark, LandmarkGroup, Obstacle, Road, Vehicle
 from coopenv.scenario.cosimulators import COSIMULATORS, Cosimulator, Highway, Program, Sumo
 from coopenv.scenario.learning import Action, Difficulty, Dynamics, Observation, Randomisation, Reward, Termination
 from coopenv.scenario.routes import Boxes, Route, followers, overlapping_pairs, possible_boxes, start_of
-from coopenv.scenario.sensing import Camera, Faults, Noise, ObserverSettings, Rates, Topology, V2x
+from coopenv.scenario.sensing import Camera, Faults, Noise, ObserverSettings, Rates, Topology, V2x, rotation_of
 
 MOST_TICKS = 1e8  # camera frames or odometry samples of one episode; counters are 32 bits wide
 

@@ -3,14 +3,14 @@
 Off by default. What is a chance or a standard deviation is drawn per vehicle and episode.
 """
 
-from typing import Annotated, Literal, Self
+import math
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from coopenv.base.errors import shown
-from coopenv.base.sections import Section
-from coopenv.scenario.base import (
+from coopenv.base.sections import (
     Direction,
     Loss,
     NonNegative,
@@ -22,9 +22,9 @@ from coopenv.scenario.base import (
     QuaternionWxyz,
     Rate,
     Sample,
+    Section,
     Vector2,
     Vector3,
-    rotation_of,
 )
 
 PerAxis = NonNegative | NonNegativeVector3
@@ -34,6 +34,24 @@ Pixels = Annotated[int, Field(ge=1, le=65_535)]
 
 ROTATION_OF_CAMERA = {"forward": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), "body": np.eye(3)}
 """Camera to body: columns are the optical frame's x (right), y (down), z (forward)."""
+
+
+def rotation_of(yaw: float | None, quaternion_wxyz: Any) -> np.ndarray:
+    """Return the rotation (3, 3) that a file gives as a quaternion or a yaw."""
+    if quaternion_wxyz is None:
+        w, x, y, z = math.cos((yaw or 0.0) / 2), 0.0, 0.0, math.sin((yaw or 0.0) / 2)
+    else:
+        w, x, y, z = quaternion_wxyz
+        length = math.sqrt(x * x + y * y + z * z + w * w)
+        w, x, y, z = w / length, x / length, y / length, z / length
+    ww, xx, yy, zz = w * w, x * x, y * y, z * z
+    return np.array(
+        [
+            [xx - yy - zz + ww, 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), -xx + yy - zz + ww, 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), -xx - yy + zz + ww],
+        ]
+    )
 
 
 def _known_model(given: object) -> object:

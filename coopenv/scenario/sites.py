@@ -13,8 +13,7 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import Field
 
 from coopenv.base.errors import ScenarioError
-from coopenv.base.sections import Section, validated
-from coopenv.scenario.base import NonNegative, Positive, PositiveVector2
+from coopenv.base.sections import NonNegative, Positive, PositiveVector2, Section, validated
 
 Point = tuple[float, float, float]
 

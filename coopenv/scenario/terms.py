@@ -12,8 +12,7 @@ from pydantic.json_schema import SkipJsonSchema
 
 from coopenv.base import installation
 from coopenv.base.errors import CoopenvError, shown, suggest
-from coopenv.base.sections import Section
-from coopenv.scenario.base import Number, Positive, Text
+from coopenv.base.sections import Number, Positive, Section, Text
 
 LOG_SCALE = 10.0
 """Decades (or nepers of log det P / 6) that fill the range of a logarithmic entry."""

@@ -28,10 +28,9 @@ from coopenv.base.installation import (
     list_envs,
     scenario_path,
 )
-from coopenv.base.sections import Section, read_toml, validated
+from coopenv.base.sections import NonNegative, Positive, Probability, Section, read_toml, validated
 from coopenv.policies.loader import AGENT_FILE, load_agent
 from coopenv.scenario import Scenario
-from coopenv.scenario.base import NonNegative, Positive, Probability
 from coopenv.scenario.cosimulators import FILES
 from coopenv.scenario.files import merged
 from coopenv.scenario.own_terms import SECTIONS, located

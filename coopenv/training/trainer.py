@@ -18,13 +18,12 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from torch import nn
 
-from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv
+from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv, LeanPpo, TanhPolicy, differentiate, outputs
 from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.base.errors import CoopenvError
 from coopenv.evaluation.metrics import SETTLED_FROM
 from coopenv.policies import decide, load_agent, restart
 from coopenv.scenario import Scenario
-from coopenv.training.ppo import LeanPpo, TanhPolicy, differentiate, outputs
 from coopenv.training.settings import Clone, Ppo, TrainingPlan
 
 EPISODES = 200

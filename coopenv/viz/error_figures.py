@@ -24,7 +24,7 @@ from coopenv.estimation.poses import error_rotation, position_covariance, roll_p
 from coopenv.viz import style
 
 if TYPE_CHECKING:
-    from coopenv.cars.calibration.findings import Calibrated
+    from coopenv.cars.calibration import Calibrated
 
 _ROW, _NARROW_ROW, _FRAME = 1.35, 0.95, 0.95  # inches
 _LAST: dict[str, Any] = {"color": style.INK, "linewidth": 0.8, "linestyle": (0, (4, 2))}

@@ -19,11 +19,10 @@ from coopenv.base.errors import DataError
 from coopenv.base.files import replacing_file
 from coopenv.base.format import fixed, jsonable, read_npz
 from coopenv.base.sections import Section, validated
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 from coopenv.estimation.poses import position_covariance
 from coopenv.observers.registry import states_covariance
-from coopenv.scenario import Scenario
-from coopenv.scenario.files import parse_scenario
+from coopenv.scenario import Scenario, parse_scenario
 from coopenv.scenario.own_terms import without_own_terms
 
 SIGMAS = 3.0

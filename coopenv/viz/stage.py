@@ -9,14 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from coopenv.estimation import Sight
 from coopenv.estimation.lens import largest_radius, undistort
-from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario
-from coopenv.scenario.base import rotation_of
 from coopenv.scenario.bodies import Body, Landmark, Vehicle
 from coopenv.scenario.routes import compile_motion, even_points, left_jacobian
 from coopenv.scenario.schema import agent_starts
-from coopenv.scenario.sensing import Camera
+from coopenv.scenario.sensing import Camera, rotation_of
 from coopenv.viz.scene import Frame, semi_axes
 
 _CIRCLE = np.linspace(0.0, 2 * np.pi, 97)

@@ -8,7 +8,7 @@ from matplotlib.patches import Rectangle
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.format import fixed
-from coopenv.estimation.outcomes import Outcome
+from coopenv.estimation import Outcome
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Body

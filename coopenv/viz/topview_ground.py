@@ -15,7 +15,7 @@ from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation, Text
 
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.viz import style

@@ -8,15 +8,14 @@ import numpy as np
 import warp as wp
 
 from coopenv.base.sections import Section
+from coopenv.estimation import KINDS, Outcome
 from coopenv.estimation.lens import largest_radius
-from coopenv.estimation.outcomes import KINDS, Outcome
 from coopenv.scenario import Scenario
-from coopenv.scenario.base import rotation_of
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.learning import FASTEST_PACE, PARAMETERS, Dynamics
 from coopenv.scenario.routes import Signal, compile_motion, even_points, followers, point_count
 from coopenv.scenario.schema import agent_starts, neighbour_sets, processing_order
-from coopenv.scenario.sensing import Camera, Faults, Noise, Rates
+from coopenv.scenario.sensing import Camera, Faults, Noise, Rates, rotation_of
 from coopenv.world.model import (
     BLIND,
     DRIVEN,

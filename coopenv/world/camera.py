@@ -8,11 +8,23 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.estimation import Sight
 from coopenv.estimation.linalg import exp_so3
-from coopenv.estimation.outcomes import Sight
-from coopenv.world.cells import body_of, cell_at, first_in, has_body, last_of_all, next_in, window_about
 from coopenv.world.model import BLIND, IDEAL
-from coopenv.world.nearby import agent_of, entry_at, entry_count, is_target, keep_those_in_range
+from coopenv.world.nearby import (
+    agent_of,
+    body_of,
+    cell_at,
+    entry_at,
+    entry_count,
+    first_in,
+    has_body,
+    is_target,
+    keep_those_in_range,
+    last_of_all,
+    next_in,
+    window_about,
+)
 from coopenv.world.random import (
     BEARING,
     BEARING_NOISE,

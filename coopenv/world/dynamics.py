@@ -12,11 +12,12 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.estimation import Outcome
 from coopenv.estimation.linalg import increment, orthonormalise, rigid_motion
-from coopenv.estimation.outcomes import Outcome
-from coopenv.world.cells import body_of, cell_at, first_in, has_body, last_of_all, next_in, window_about
 from coopenv.world.model import DRIVEN, PRESCRIBED
+from coopenv.world.nearby import body_of, cell_at, first_in, has_body, last_of_all, next_in, window_about
 from coopenv.world.route import (
+    UNDER_WAY,
     draw_next_route,
     goal_distance,
     has_next_route,
@@ -27,7 +28,6 @@ from coopenv.world.route import (
 )
 from coopenv.world.warp_internals import device_function
 
-UNDER_WAY = wp.constant(int(Outcome.UNDER_WAY))
 ARRIVED = wp.constant(int(Outcome.ARRIVED))
 COLLIDED = wp.constant(int(Outcome.COLLIDED))
 OFF_ROUTE = wp.constant(int(Outcome.OFF_ROUTE))

@@ -13,12 +13,12 @@ import warp as wp
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Coordinates, Rule
 from coopenv.world.camera import observe
-from coopenv.world.cells import sort_into_cells
 from coopenv.world.dynamics import depart, move, move_landmarks, referee
 from coopenv.world.model import Precision
+from coopenv.world.nearby import sort_into_cells
 from coopenv.world.odometry import measure_odometry
 from coopenv.world.reset import begin_sensing, place_everybody
-from coopenv.world.traffic import appear, direct_traffic
+from coopenv.world.route import appear, direct_traffic
 from coopenv.world.v2x import transmit
 from coopenv.world.warp_internals import device_function
 

@@ -129,7 +129,7 @@ def model_struct(p: Precision) -> Any:
         latency_ticks: wp.int32
         dead_band: scalar  # m/s
         gated: wp.int32  # 1: commands change gradually
-        in_traffic: wp.int32  # 1: the model of traffic drives it, see `coopenv.world.traffic`
+        in_traffic: wp.int32  # 1: the model of traffic drives it, see `coopenv.world.route`
         acceleration_mode: wp.int32  # 1: the first entry of an action is an acceleration
         action_steering: scalar  # of an action of 1
         pan_limit: scalar  # of the camera; 0: it does not turn
@@ -152,7 +152,7 @@ def model_struct(p: Precision) -> Any:
 
     @wp.struct
     class Cells:
-        """The grid in which bodies are found, see `coopenv.world.cells`."""
+        """The grid in which bodies are found, see `coopenv.world.nearby`."""
 
         across: wp.int32  # cells along each axis, a power of two; 1: all pairs are tested
         per_metre: scalar  # 1 / edge of a cell

@@ -19,8 +19,8 @@ import numpy as np
 import warp as wp
 
 from coopenv.base.errors import CoopenvError, shown
-from coopenv.base.format import LARGEST
-from coopenv.estimation.outcomes import Sight
+from coopenv.base.sections import LARGEST
+from coopenv.estimation import Sight
 from coopenv.estimation.poses import (
     Array,
     Fields,
@@ -392,7 +392,7 @@ def state_struct(p: Precision) -> Any:
         kept_order: array("WNV", wp.int32, KEPT_ORDER)  # entries in the order of their agents
         crowded: array("WN", wp.int32, whole(0, "agents"))  # agents in range for which there is no room
 
-        first_item: array("WG", wp.int32, FIRST_ITEM)  # of each cell; scratch, like the next, see `coopenv.world.cells`
+        first_item: array("WG", wp.int32, FIRST_ITEM)  # of each cell; scratch, like the next, see nearby.py
         next_item: array("WI", wp.int32, NEXT_ITEM)  # in the same cell; -1: none
         body_reach: array("W", scalar)  # m, the farthest point of a box from its item
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.estimation import COLLUDE, HONEST, REPLAY
 from coopenv.estimation.linalg import exp_so3, identity3, join6
-from coopenv.estimation.outcomes import COLLUDE, HONEST, REPLAY
 from coopenv.world.camera import VISIBLE, mapped_position
 from coopenv.world.nearby import agent_of, box_of_entry, entry_at, entry_count, sender_of
 from coopenv.world.random import (

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.base.errors import CoopenvError, check_memory
-from coopenv.estimation.outcomes import UNKNOWN, Sight
+from coopenv.estimation import UNKNOWN, Sight
 from coopenv.estimation.poses import Coordinates, Rule
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import PARAMETERS

@@ -18,11 +18,11 @@ from coopenv.cars import codec
 from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
 from coopenv.cars.deployment import load_deployment
+from coopenv.cars.fake import fake_fault
 from coopenv.cars.fake.car import Fake
-from coopenv.cars.fake.faults import fake_fault
-from coopenv.cars.gate.core import GateClock, write_drive
+from coopenv.cars.gate import GateClock, write_drive
 from coopenv.cars.profile import MotionCommand, Role
-from coopenv.cars.transport.base import Arrival, matcher
+from coopenv.cars.transport import Arrival, matcher
 
 FLEET = Path(__file__).parents[1] / "fleet" / "overtaking.toml"
 KEPT = (Role.DETECTIONS, Role.CAMERA_INFO, Role.WHEEL, Role.IMU, Role.TRUTH)

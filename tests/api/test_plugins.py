@@ -18,7 +18,7 @@ import coopenv.observers.registry as registry
 from coopenv import CoopenvError
 from coopenv.api.engine import Engine
 from coopenv.observers import Coordinates, Estimate, Setup, Tick, find, register, run
-from coopenv.observers.single_frame import DeadReckoning
+from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.runs.recorder import record
 from tests.helpers import mrclam_files
 from tests.helpers.four_way import FOUR_WAY

@@ -17,8 +17,8 @@ from coopenv import CoopenvError
 from coopenv.api.engine import Engine
 from coopenv.backends.base import VehicleBroadcast
 from coopenv.observers import Message, Received, register, registry, run
+from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.observers.recording import Sensed, check_recording
-from coopenv.observers.single_frame import DeadReckoning
 from coopenv.policies import load_policy
 from coopenv.runs import record
 from coopenv.world.launch import kernel

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 import coopenv
 from coopenv import CoopenvError
 from coopenv.api.engine import Engine
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 
 pytest.importorskip("highway_env", reason="needs the extra highway")
 

@@ -13,7 +13,7 @@ import pytest
 
 from coopenv import DataError
 from coopenv.backends.mcap import container, read_recording, write_recording
-from coopenv.backends.replay import Replay
+from coopenv.backends.worlds import Replay
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.mcap_edits import Sent, edit
 from tests.helpers.recordings import simulated

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coopenv.backends.mrclam import VARIANTS, load_dataset
-from coopenv.backends.mrclam.dataset import MAX_HOLD_S, HeldCommands, MotionCapture, find_folder
-from coopenv.backends.mrclam.recording import check_variant, counted
+from coopenv.backends.mrclam import VARIANTS, check_variant, counted, load_dataset
+from coopenv.backends.mrclam_dataset import MAX_HOLD_S, HeldCommands, MotionCapture, find_folder
 from coopenv.base.errors import DataError, DataWarning
 from tests.helpers.mrclam_files import LANDMARKS, ORIGIN, command, pose, write
 

@@ -24,11 +24,9 @@ from coopenv.api.parallel_env import CooperativeLocalisationEnv as Env
 from coopenv.backends.base import Backend, Command
 from coopenv.backends.mcap import write_recording
 from coopenv.backends.mcap.recordings import read_recording
-from coopenv.backends.mrclam import load_dataset
-from coopenv.backends.mrclam.recording import recording_of
-from coopenv.backends.replay import Replay
-from coopenv.backends.simulated import Simulated
+from coopenv.backends.mrclam import load_dataset, recording_of
 from coopenv.backends.tick_world import TickWorld, open_world
+from coopenv.backends.worlds import Replay, Simulated
 from coopenv.observers import Recording, run
 from coopenv.runs import record
 from coopenv.scenario import Scenario

@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose
 import coopenv
 from coopenv import CoopenvError
 from coopenv.api.engine import Engine
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 from tests.helpers.sumo import CROSSING, EXACT, grid, own_simulation
 
 pytest.importorskip("libsumo", reason="needs the extra sumo")

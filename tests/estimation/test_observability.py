@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import eigvals
 from scipy.spatial.transform import Rotation
 
+from coopenv.estimation import Sight
 from coopenv.estimation.observability import (
     Trajectory,
     analyse_observability,
@@ -21,7 +22,6 @@ from coopenv.estimation.observability import (
     least_mean,
     slowest_decay,
 )
-from coopenv.estimation.outcomes import Sight
 from coopenv.runs.rollouts import rollout
 from coopenv.scenario import load_scenario
 from tests.helpers.env_suite import rest_slow

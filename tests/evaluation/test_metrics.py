@@ -9,7 +9,7 @@ import pytest
 
 import coopenv
 from coopenv.api.engine import Engine
-from coopenv.estimation.outcomes import Outcome
+from coopenv.estimation import Outcome
 from coopenv.evaluation import METRICS, Episodes, compare_paired, drive, held_out_seeds, score
 from coopenv.evaluation.metrics import Quantile, Ratio, interval, resamples
 from coopenv.policies import load_agent

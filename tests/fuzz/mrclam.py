@@ -11,7 +11,7 @@ import numpy as np
 
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.backends.mrclam import VARIANTS, load_dataset, recording_of
-from coopenv.backends.replay import Replay
+from coopenv.backends.worlds import Replay
 from coopenv.observers import Recording
 from tests.fuzz.harness import go_through, taken
 from tests.helpers import mrclam_files

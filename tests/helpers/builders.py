@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.simulated import Simulated
+from coopenv.backends.worlds import Simulated
 from coopenv.base.errors import ScenarioWarning
 from coopenv.scenario import Scenario, parse_scenario
 from coopenv.world.world import World

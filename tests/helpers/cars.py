@@ -13,7 +13,7 @@ from coopenv.cars.codec import encode, make
 from coopenv.cars.deployment import load_deployment
 from coopenv.cars.fake.car import Fake, fault_topic
 from coopenv.cars.fake.fleet import prepare_fake, run
-from coopenv.cars.transport.base import Transport
+from coopenv.cars.transport import Transport
 from tests.helpers.hub import Hub
 
 PATIENT = """

@@ -14,9 +14,9 @@ from coopenv.cars.backend.binding import bind
 from coopenv.cars.codec import decode, encode, make
 from coopenv.cars.deployment import Car, Deployment, Sensors
 from coopenv.cars.fake.car import Fake, fault_topic
-from coopenv.cars.gate.core import GateClock, write_drive
+from coopenv.cars.gate import GateClock, write_drive
 from coopenv.cars.profile import RESET_TOPIC, SVEA, CarProfile, MotionCommand, Role
-from coopenv.cars.transport.base import Arrival
+from coopenv.cars.transport import Arrival
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.hub import Hub
 

@@ -13,7 +13,7 @@ import numpy as np
 from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.deployment import load_deployment
-from coopenv.cars.transport.base import Transport
+from coopenv.cars.transport import Transport
 from tests.helpers.processes import COOPENV, ROOT, start, wait_until
 
 FLEET = ROOT / "examples" / "fleet" / "tags.toml"

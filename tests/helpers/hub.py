@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from coopenv.cars.transport.base import Arrival, Callback, matcher
+from coopenv.cars.transport import Arrival, Callback, matcher
 
 Matcher = Callable[[str], bool]
 

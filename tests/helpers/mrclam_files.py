@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from coopenv.backends.mrclam import Dataset, recording_of
-from coopenv.backends.mrclam.dataset import MotionCapture, Robot
+from coopenv.backends.mrclam_dataset import MotionCapture, Robot
 from coopenv.observers.recording import PER_TICK, Recording
 
 ORIGIN = 1248444187.0

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from coopenv.backends.replay import Replay
+from coopenv.backends.worlds import Replay
 from coopenv.observers import Message, Recording, Run, run
 from coopenv.observers.contract import Factory
 from coopenv.observers.group import Tamper

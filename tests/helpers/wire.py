@@ -9,7 +9,7 @@ import sys
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from coopenv.cars.transport.base import Arrival, Transport
+from coopenv.cars.transport import Arrival, Transport
 from tests.helpers.processes import started
 
 PING, PONG, ECHO = "fleet/ping", "fleet/pong", "fleet/alive/echo"

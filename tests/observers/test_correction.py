@@ -16,7 +16,7 @@ from coopenv.estimation.poses import right_jacobian
 from coopenv.observers import Coordinates, Estimate, Recording, SensorNoise, run
 from coopenv.observers.bearing_measurements import INVARIANT, LEFT, RIGHT, UncertainPose, recentring
 from coopenv.observers.correction import LARGEST, InnovationGate, iterated
-from coopenv.observers.error_state_filters import SPREAD, LeftInvariant, Mekf, MekfCovariance, Ukf, sigma_points
+from coopenv.observers.pose_filters import SPREAD, LeftInvariant, Mekf, MekfCovariance, Ukf, sigma_points
 from coopenv.runs.recorder import record
 from tests.helpers.recordings import completed
 from tests.observers.test_filters import QUIET, derivative, kalman, pose, spd, tick

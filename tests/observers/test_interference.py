@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose
 
-from coopenv.backends.replay import Replay
+from coopenv.backends.worlds import Replay
 from coopenv.base.errors import CoopenvError, world_keys
 from coopenv.observers import Message, Recording, run
 from coopenv.observers.centralised import Centralised
 from coopenv.observers.contract import Tick, check_received
-from coopenv.observers.error_state_filters import MekfCovariance
+from coopenv.observers.pose_filters import MekfCovariance
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.world.world import World

@@ -16,12 +16,12 @@ from numpy.testing import assert_allclose
 
 import coopenv
 from coopenv.api.engine import Engine
-from coopenv.backends.replay import Replay
+from coopenv.backends.worlds import Replay
 from coopenv.base.errors import CoopenvError
 from coopenv.observers import Estimate, Message, Received, Recording, Tick, register, registry
 from coopenv.observers.kernel_observer import MOST_UNITS, UNITS_PER_TICK
+from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.observers.registry import find, find_embedded, named, portable
-from coopenv.observers.single_frame import DeadReckoning
 from coopenv.scenario.schema import neighbour_sets
 from coopenv.world.embedded import Embedded, send_nothing, start_nothing
 from coopenv.world.state import array
@@ -300,7 +300,7 @@ def test_names_are_taken_once() -> None:
 
 
 SOURCE = """
-from coopenv.observers.single_frame import DeadReckoning
+from coopenv.observers.pose_filters import DeadReckoning
 
 class Mine(DeadReckoning):
     pass
@@ -331,8 +331,7 @@ def test_a_place_gets_the_name_of_its_class(folder: Path) -> None:
     assert find("Mine") is find("mine.py:Mine")
     assert portable("Mine") == f"{folder.resolve()}/mine.py:Mine"
     assert (
-        named("coopenv.observers.error_state_filters:Ukf") == "Ukf"
-        and portable("Ukf") == "coopenv.observers.error_state_filters:Ukf"
+        named("coopenv.observers.pose_filters:Ukf") == "Ukf" and portable("Ukf") == "coopenv.observers.pose_filters:Ukf"
     )
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from coopenv.observers import Message, Received, Recording, Tick
 from coopenv.observers.bearing_measurements import LEFT, LinearisedBearings, UncertainPose
 from coopenv.observers.centralised import Centralised, FirstEstimatesEkf, ObservabilityConstrainedEkf
-from coopenv.observers.single_frame import PerspectivePoints
+from coopenv.observers.pose_filters import PerspectivePoints
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.helpers.recordings import completed

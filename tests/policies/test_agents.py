@@ -14,7 +14,7 @@ import pytest
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.installation import data_directory, list_agents
-from coopenv.estimation.outcomes import Outcome
+from coopenv.estimation import Outcome
 from coopenv.evaluation import METRICS, drive
 from coopenv.policies import act, agents_for, decide, find_agent, load_agent, load_policy, restart
 from coopenv.policies.base import played_back

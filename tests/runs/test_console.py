@@ -26,8 +26,9 @@ from coopenv.runs import scenario_text as words
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.scenario_text import IMAGE_FIELDS, settings
 from coopenv.runs.summary import describe_scenario
+from coopenv.scenario import parse_scenario
 from coopenv.scenario.bodies import ConstantMotion, InitialEstimate, SegmentMotion, TwistSegment, WaypointMotion
-from coopenv.scenario.files import apply_vehicle_defaults, parse_scenario, schema_text
+from coopenv.scenario.files import apply_vehicle_defaults, schema_text
 from coopenv.world import launch
 from tests.helpers.commands import printed
 from tests.helpers.four_way import FOUR_WAY

@@ -17,9 +17,9 @@ import coopenv
 from coopenv.base.errors import CoopenvError, DeviceError
 from coopenv.base.format import json_text
 from coopenv.cli import main
+from coopenv.estimation import Sight
 from coopenv.estimation.metrics import CONVERGED
 from coopenv.estimation.observability import Trajectory, analyse_observability
-from coopenv.estimation.outcomes import Sight
 from coopenv.policies import load_agent
 from coopenv.runs import Rollout, rollout
 from coopenv.runs.console import legend, metrics_table, rates, remarks

@@ -23,7 +23,7 @@ from coopenv.runs.live import FAULTS, EngineReel, Reel, vehicle_index
 from coopenv.runs.scenes import driver_of, open_source, scene_of
 from coopenv.runs.view import Viewer
 from coopenv.viz.scene import Origin
-from coopenv.viz.web.page import free_port, guarded_server
+from coopenv.viz.web import free_port, guarded_server
 from tests.helpers.fleet import Fleet
 from tests.helpers.processes import wait_until
 

@@ -10,9 +10,9 @@ import pytest
 
 from coopenv.base.installation import list_agents, list_envs
 from coopenv.cars.deployment import Car, Deployment, GateLink, NetworkSettings, Remote, Safety, Security, Sensors
-from coopenv.cars.fake.faults import FakeSettings
+from coopenv.cars.fake import FakeSettings
 from coopenv.cars.profile import SVEA
-from coopenv.cars.transport.base import Tls
+from coopenv.cars.transport import Tls
 from coopenv.observers import registry
 from coopenv.observers.registry import ZOO
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS

@@ -18,9 +18,9 @@ from mpl_toolkits.mplot3d import proj3d
 from scipy.stats import chi2
 
 import coopenv
+from coopenv.estimation import Sight
 from coopenv.estimation.metrics import summarise
 from coopenv.estimation.observability import Trajectory, analyse_observability
-from coopenv.estimation.outcomes import Sight
 from coopenv.viz import FIGURE_NAMES, error_figures, style
 from coopenv.viz.error_figures import error_figure, observability_figure, unwrapped
 from coopenv.viz.figures import save_figures, topology_figure

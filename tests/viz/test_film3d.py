@@ -14,13 +14,13 @@ from scipy.spatial.transform import Rotation
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
-from coopenv.viz.camera_image import Lens
+from coopenv.viz.perspective import Lens
 from coopenv.viz.scene import Frame
 from coopenv.viz.stage import Stage, entries
 from coopenv.viz.style import vehicle_colour
 
 pytest.importorskip("pyvista", reason="needs the extra film3d")
-from coopenv.viz.film3d import View3d
+from coopenv.viz.perspective import View3d
 
 SIZE = (480, 360)
 

@@ -16,15 +16,15 @@ import pytest
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError, DataError
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 from coopenv.policies import decide, load_policy
 from coopenv.runs.scenes import scene_of
-from coopenv.viz.camera_image import Lens
+from coopenv.viz.meshes import Look, linear, placed, spacing_of
+from coopenv.viz.perspective import Lens
 from coopenv.viz.scene import Frame, Origin, SceneRecord
 from coopenv.viz.stage import Stage, entries
 from coopenv.viz.topview import TopView
-from coopenv.viz.web.ground import Look, linear, placed, spacing_of
-from coopenv.viz.web.page import write_replay
+from coopenv.viz.web import write_replay
 from coopenv.viz.web.panel import GAIN, table_html
 from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, first_look, level_lines, levels, stopped
 

@@ -20,10 +20,10 @@ from matplotlib.colors import to_rgb
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.format import fixed
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 from coopenv.scenario import load_scenario
 from coopenv.scenario.sensing import Camera
-from coopenv.viz.camera_image import Lens, _before, camera_image, pixels
+from coopenv.viz.perspective import Lens, _before, camera_image, pixels
 from coopenv.viz.scene import Frame
 from coopenv.viz.stage import (
     Box,

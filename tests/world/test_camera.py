@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 from coopenv.world import camera
 from coopenv.world.model import entry_struct, precision
 from tests.helpers.builders import landmark, quaternion_wxyz, run, scenario, start, vehicle
@@ -32,7 +32,7 @@ def rotations(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def test_a_target_is_in_view_up_to_each_edge_of_the_image() -> None:
-    """Half a pixel to either side of an edge; tests/world/test_cells.py has ranges and what hides a target."""
+    """Half a pixel to either side of an edge; tests/world/test_nearby.py has ranges and what hides a target."""
     pixels = [(u, 100.0) for u in (-0.5, 0.5, SIZE["width"] - 0.5, SIZE["width"] + 0.5)]
     pixels += [(150.0, v) for v in (-0.5, 0.5, SIZE["height"] - 0.5, SIZE["height"] + 0.5)]
     lever, R = np.array([0.3, 0.1, 0.2]), Rotation.from_rotvec([0.3, -0.4, 2.0]).as_matrix()

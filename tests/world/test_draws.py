@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import evaluation_seed
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import PARAMETERS
 from tests.helpers.builders import constant, estimated_position, landmark, raw, reset, run, scenario, start, vehicle

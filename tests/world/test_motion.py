@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.outcomes import Outcome
+from coopenv.estimation import Outcome
 from coopenv.scenario.routes import Boxes
 from coopenv.world import dynamics
 from tests.helpers.builders import command, constant, landmark, reset, run, scenario, start, vehicle

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.api.arguments import LASTING_SCALE
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 from coopenv.world.state import LASTING_ERRORS
 from tests.helpers.builders import command, constant, run, same_bits, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.api.engine import Engine
 from coopenv.base.errors import ScenarioError
-from coopenv.estimation import metrics, poses
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight, metrics, poses
 from coopenv.estimation.poses import left_covariance
 from coopenv.scenario import load_scenario
 from coopenv.world import quality, random

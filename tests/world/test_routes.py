@@ -14,7 +14,7 @@ from scipy import stats
 import coopenv
 from coopenv import ScenarioError
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
-from coopenv.estimation.outcomes import Outcome, Sight
+from coopenv.estimation import Outcome, Sight
 from coopenv.scenario import Scenario
 from coopenv.world.launch import start_warp
 from coopenv.world.model import precision

@@ -16,9 +16,9 @@ from coopenv.api.engine import Engine
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.mcap.recordings import read_recording, write_recording
-from coopenv.backends.replay import Replay
+from coopenv.backends.worlds import Replay
 from coopenv.base.errors import ActionError, ScenarioError
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 from coopenv.observers.runner import observer_init_of
 from coopenv.policies.base import decide, random_policy, zero_policy
 from coopenv.runs import record

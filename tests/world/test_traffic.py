@@ -10,7 +10,7 @@ from scipy import stats
 
 import coopenv
 from coopenv import ScenarioError
-from coopenv.estimation.outcomes import Outcome, Sight
+from coopenv.estimation import Outcome, Sight
 from coopenv.runs.recorder import record
 from tests.helpers.builders import command, run, scenario, start
 

@@ -15,19 +15,24 @@ from coopenv.world.camera import (
     project,
     segment_hits_box,
 )
-from coopenv.world.cells import ROUNDING, WIDER, cell_at, cell_of, first_in, next_in
-from coopenv.world.dynamics import ACCELERATION, ARRIVED, SPEED, STEERING, UNDER_WAY
+from coopenv.world.dynamics import ACCELERATION, ARRIVED, SPEED, STEERING
 from coopenv.world.model import DRIVEN
 from coopenv.world.nearby import (
+    ROUNDING,
+    WIDER,
     agent_of,
     box_of_entry,
+    cell_at,
+    cell_of,
     entry_count,
     entry_of,
+    first_in,
     kept_before,
+    next_in,
     sender_of,
 )
 from coopenv.world.quality import position_covariance
-from coopenv.world.route import goal_distance, place_on_route, point_on_route, route_length
+from coopenv.world.route import UNDER_WAY, goal_distance, place_on_route, point_on_route, route_length
 from coopenv.world.v2x import fresh
 from coopenv.world.warp_internals import device_function
 

@@ -19,13 +19,13 @@ from coopenv.api.terms.records import Ego, MapLandmark, Neighbour, Target, Truth
 from coopenv.api.terms.results import Records, write_records
 from coopenv.base import installation
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.outcomes import Outcome
+from coopenv.estimation import Outcome
 from coopenv.scenario import Scenario
 from coopenv.scenario.own_terms import record_count
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS, TERMINATION_CONDITIONS, Registry, TermRow
 from coopenv.world import launch
-from coopenv.world.dynamics import UNDER_WAY
 from coopenv.world.launch import PerWorld, compiler_options
+from coopenv.world.route import UNDER_WAY
 from coopenv.world.state import allocate
 from coopenv.world.world import World
 

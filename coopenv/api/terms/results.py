@@ -37,7 +37,6 @@ from coopenv.api.terms.records import (
 from coopenv.estimation.linalg import rotation_angle
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
-from coopenv.world.dynamics import UNDER_WAY
 from coopenv.world.model import DRIVEN, Precision
 from coopenv.world.quality import (
     cholesky_of,
@@ -48,7 +47,7 @@ from coopenv.world.quality import (
     position_variance,
     targets_in_view,
 )
-from coopenv.world.route import remaining_way
+from coopenv.world.route import UNDER_WAY, remaining_way
 from coopenv.world.state import FLAG, NUMBER, array, whole
 from coopenv.world.warp_internals import device_function
 

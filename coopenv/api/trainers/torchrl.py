@@ -8,7 +8,7 @@ from coopenv.api.arguments import STATE_LIMIT
 from coopenv.api.make import make_vec
 from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.base.installation import install_command
-from coopenv.estimation.outcomes import Outcome
+from coopenv.estimation import Outcome
 from coopenv.scenario import ScenarioLike
 from coopenv.world.reset import ABSENT
 

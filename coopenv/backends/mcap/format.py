@@ -21,11 +21,10 @@ from pydantic import Field, create_model
 from coopenv.base.errors import CoopenvError, DataError
 from coopenv.base.format import jsonable
 from coopenv.base.installation import install_command, message_types, needing, version
-from coopenv.base.sections import Section, validated
+from coopenv.base.sections import Number, Section, Vector3, validated
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Drawn, Recording
-from coopenv.scenario.base import Number, Vector3
-from coopenv.scenario.files import parse_scenario
+from coopenv.scenario import parse_scenario
 from coopenv.scenario.own_terms import without_own_terms
 
 FORMAT = "coopenv recording 1"

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from coopenv.backends.base import Backend
-from coopenv.backends.mrclam.dataset import IN_SPACE
+from coopenv.backends.mrclam_dataset import IN_SPACE
 from coopenv.backends.sources import SourceKind, is_bag, kind_of, open_backend, open_recording
 from coopenv.base.errors import CoopenvError, DataWarning, suggest
 from coopenv.bench.observers.changes import NO_FOLLOWERS, leaders_of

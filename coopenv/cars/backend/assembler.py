@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding, NeighbourInbox
-from coopenv.cars.backend.tracks import FrameQueue, Odometer, PoseTrack
+from coopenv.cars.backend.buffers import FrameQueue, Odometer, PoseTrack
 from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Sensors
 from coopenv.cars.profile import VELOCITY, Role
 from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, read
-from coopenv.cars.transport.base import Arrival
+from coopenv.cars.transport import Arrival
 from coopenv.cars.vision import Calibration
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Message, sealed

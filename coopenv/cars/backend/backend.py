@@ -21,15 +21,15 @@ from coopenv.cars.backend.binding import (
     report_message,
     reset_options,
 )
+from coopenv.cars.backend.buffers import ROLES, StatusBoard
 from coopenv.cars.backend.drive import PRESENCE, DriveRecorder, RecordedTransport, head_of
 from coopenv.cars.backend.station import UNTRIED, Gates, Pacer, Station
-from coopenv.cars.backend.status import ROLES, StatusBoard
 from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog, bearing_nis, since
 from coopenv.cars.codec import encode, make, warm_up
 from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.keys import Signer, Verifier, load_keys
 from coopenv.cars.profile import RESET_TOPIC, VELOCITY, Role, presence_of
-from coopenv.cars.transport.base import Transport
+from coopenv.cars.transport import Transport
 from coopenv.cars.transport.zenoh import open_transport
 from coopenv.estimation.poses import left_covariance
 from coopenv.observers.recording import Sensed

@@ -9,7 +9,7 @@ import numpy as np
 
 from coopenv.backends.base import VehicleBroadcast, check_options
 from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
-from coopenv.cars.backend.tracks import PlaceTrack
+from coopenv.cars.backend.buffers import PlaceTrack
 from coopenv.cars.codec import header, make, pose
 from coopenv.cars.deployment import Car
 from coopenv.cars.profile import SVEA, CarProfile, Role
@@ -18,8 +18,8 @@ from coopenv.estimation.poses import Array, left_covariance, skew
 from coopenv.observers.contract import Message, Received
 from coopenv.observers.robust.messages import from_six
 from coopenv.scenario import Scenario
-from coopenv.scenario.base import rotation_of
 from coopenv.scenario.schema import neighbour_sets
+from coopenv.scenario.sensing import rotation_of
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,9 @@ from coopenv.cars.backend.station import refusal
 from coopenv.cars.codec import STOPPED, TICK, decode, encode, header, make, stamp_of
 from coopenv.cars.deployment import Deployment, parse_deployment
 from coopenv.cars.profile import STOPPED_TOPIC, TICK_TOPIC, presence_of
-from coopenv.cars.transport.base import Arrival, Transport
-from coopenv.scenario.files import override, parse_scenario
+from coopenv.cars.transport import Arrival, Transport
+from coopenv.scenario import parse_scenario
+from coopenv.scenario.files import override
 from coopenv.scenario.own_terms import without_own_terms
 
 FORMAT = "coopenv drive 1"

@@ -12,10 +12,10 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import MOST_BYTES, decode, encode, header, make, stamp_of
-from coopenv.cars.gate.core import GateMode, Reason, write_drive
+from coopenv.cars.gate import GateMode, Reason, write_drive
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.profile import GATE_TYPES, NEUTRAL, SVEA, CarProfile, Limits, Role
-from coopenv.cars.transport.base import Arrival, Transport
+from coopenv.cars.transport import Arrival, Transport
 
 MOST_WAITING = 256
 """Messages of one topic that wait for the next tick; older ones are dropped, so that a flood fills nothing."""

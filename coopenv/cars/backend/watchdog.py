@@ -15,7 +15,7 @@ from coopenv.backends.base import VehicleBroadcast
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.station import BYPASSED, OLD, OPEN, Gates, Station
 from coopenv.cars.deployment import Safety
-from coopenv.cars.gate.core import Reason
+from coopenv.cars.gate import Reason
 from coopenv.cars.profile import Role, inside, presence_of
 from coopenv.cars.readings import CarPose, Sample
 from coopenv.estimation.poses import Array, skew

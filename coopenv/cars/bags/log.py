@@ -28,11 +28,11 @@ from coopenv.cars.bags.clocks import Delay, Leads, checked, jumps, leads_of, mov
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TRUTH, Chosen, MapFrame, TopicMap, select
 from coopenv.cars.codec import encode, stamp_of
-from coopenv.cars.gate.core import read_drive
+from coopenv.cars.gate import read_drive
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, read
 from coopenv.cars.vision import Calibration
-from coopenv.scenario.base import rotation_of
+from coopenv.scenario.sensing import rotation_of
 
 NS, IMU = 1_000_000_000, "sensor_msgs/msg/Imu"
 

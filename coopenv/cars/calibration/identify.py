@@ -8,11 +8,11 @@ import numpy as np
 from scipy.stats import ks_2samp
 
 from coopenv.base.errors import DataError, check_one_of
+from coopenv.cars.calibration import Row, tables_text
 from coopenv.cars.calibration.batch import deviation, stated_rate
-from coopenv.cars.calibration.findings import Row, tables_text
 from coopenv.cars.calibration.response import DEAD_BAND, KINDS, Response, constants_of
+from coopenv.cars.fake import USUAL, FakeSettings
 from coopenv.cars.fake.car import Sent, replay
-from coopenv.cars.fake.faults import USUAL, FakeSettings
 from coopenv.cars.profile import MotionCommand, Role
 from coopenv.cars.readings import CarPose, Detections, Sample, tracks_of
 from coopenv.estimation.poses import Array

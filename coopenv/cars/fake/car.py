@@ -15,14 +15,14 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode, pose, stamp_of, warm_up
-from coopenv.cars.fake.faults import USUAL, CarFaults, FakeSettings, Wire, end_process, fake_fault, fault_topic
+from coopenv.cars.fake import USUAL, CarFaults, FakeSettings, Wire, end_process, fake_fault, fault_topic
 from coopenv.cars.fake.sensors import LEADER_RATE, TRUTH_RATE, Act, CarSensors, FakeCamera, SensorPublisher
 from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
-from coopenv.cars.gate.core import PERIOD, GateClock, Malformed, read_drive, write_drive
-from coopenv.cars.gate.process import CLOCK, GateConnection
+from coopenv.cars.gate import PERIOD, GateClock, Malformed, read_drive, write_drive
+from coopenv.cars.gate_process import CLOCK, GateConnection
 from coopenv.cars.profile import RESET_TOPIC, MotionCommand, Role, presence_of
 from coopenv.cars.readings import READERS, CarPose, Sample, read
-from coopenv.cars.transport.base import Callback, Transport
+from coopenv.cars.transport import Callback, Transport
 from coopenv.cars.vision import Calibration
 
 LATE = 50_000_000

@@ -19,7 +19,7 @@ from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
 from coopenv.cars.deployment import load_deployment
 from coopenv.cars.fake.car import Fake
-from coopenv.cars.gate.process import CLOCK, prepare_gate
+from coopenv.cars.gate_process import CLOCK, prepare_gate
 
 READY = 300.0
 """s that fakes have until they can be seen: the first ones on a computer compile the simulation's kernels."""

@@ -15,11 +15,11 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import encode, header, make, ros2
-from coopenv.cars.fake.faults import AHEAD, CarFaults, FakeSettings
+from coopenv.cars.fake import AHEAD, CarFaults, FakeSettings
 from coopenv.cars.fake.world import CarWorld, Neighbours
 from coopenv.cars.profile import IMAGES, CarProfile, Role
 from coopenv.cars.see import object_bearings
-from coopenv.cars.transport.base import Transport
+from coopenv.cars.transport import Transport
 from coopenv.cars.vision import Calibration, dictionary_of, opencv, rays
 from coopenv.estimation.poses import Array
 from coopenv.scenario.sensing import Noise

@@ -13,15 +13,15 @@ from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode
 from coopenv.cars.profile import NEUTRAL, MotionCommand, Role
 from coopenv.cars.readings import CarPose, read
-from coopenv.cars.transport.base import Arrival, Transport
-from coopenv.estimation.outcomes import Sight
+from coopenv.cars.transport import Arrival, Transport
+from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario
 from coopenv.world.camera import observe
-from coopenv.world.cells import sort_into_cells
 from coopenv.world.dynamics import drive, prescribe
 from coopenv.world.launch import PerWorld
 from coopenv.world.model import PRESCRIBED
+from coopenv.world.nearby import sort_into_cells
 from coopenv.world.odometry import drift
 from coopenv.world.world import World
 

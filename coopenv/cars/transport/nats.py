@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import Any
 
 from coopenv.base.installation import install_command, needing
-from coopenv.cars.transport.base import (
+from coopenv.cars.transport import (
     Arrival,
     Callback,
     HeartbeatTransport,

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, needing
 from coopenv.cars.deployment import Deployment, DeploymentError
-from coopenv.cars.transport.base import (
+from coopenv.cars.transport import (
     SECURE,
     UNIX,
     Arrival,
@@ -164,7 +164,7 @@ def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:
     network, certificates = deployment.network, certificates_of(deployment)
     if network.kind == "zenoh":
         return open_zenoh("client", network.connect, tls=certificates, timeout=timeout)
-    from coopenv.cars.transport.authors import Authors, routes_of
+    from coopenv.cars.transport.ros1 import Authors, routes_of
 
     routes = [route for car in deployment.cars for route in routes_of(car, deployment.profile)]  # before any is opened
     if network.kind == "nats":

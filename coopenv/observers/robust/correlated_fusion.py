@@ -16,15 +16,6 @@ import warp as wp
 
 from coopenv.estimation.linalg import THIRD, block3, symmetric_part
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.belief import (
-    apply_corrections,
-    index_of,
-    insert_member,
-    make_room,
-    mark_seen,
-    recentre,
-    set_block,
-)
 from coopenv.observers.robust.correlations import (
     by_clocks,
     correlated_tick,
@@ -33,11 +24,20 @@ from coopenv.observers.robust.correlations import (
     regress,
     stated_covariance,
 )
+from coopenv.observers.robust.integrity import add_to_drift
+from coopenv.observers.robust.joint_state import (
+    TWELFTH,
+    apply_corrections,
+    index_of,
+    insert_member,
+    make_room,
+    mark_seen,
+    recentre,
+    set_block,
+)
 from coopenv.observers.robust.measurements import is_received
 from coopenv.observers.robust.memory import Member, Pose, PoseEstimate, mat66d, vec6d
 from coopenv.observers.robust.messages import bit_of, depends_on_own, includes, propagate_member
-from coopenv.observers.robust.propagation import TWELFTH
-from coopenv.observers.robust.source_monitor import add_to_drift
 from coopenv.observers.robust.sources import clear_drift, clear_source, is_excluded, take_slot
 from coopenv.world.camera import VISIBLE
 from coopenv.world.nearby import box_of, box_of_entry, entry_at, entry_count, sender_of

@@ -13,7 +13,8 @@ import warp as wp
 
 from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.belief import insert_member, remove_member, set_block
+from coopenv.observers.robust.integrity import end_block, restart_fault
+from coopenv.observers.robust.joint_state import begin_calibration, insert_member, mounting_of, remove_member, set_block
 from coopenv.observers.robust.measurements import innovation_weight
 from coopenv.observers.robust.memory import (
     ERRORS,
@@ -29,8 +30,6 @@ from coopenv.observers.robust.memory import (
     vec6d,
 )
 from coopenv.observers.robust.messages import includes
-from coopenv.observers.robust.propagation import begin_calibration, mounting_of
-from coopenv.observers.robust.source_monitor import end_block, restart_fault
 from coopenv.observers.robust.sources import (
     CAMERA,
     GYRO,

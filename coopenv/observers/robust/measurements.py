@@ -18,10 +18,9 @@ from coopenv.observers.robust.algebra import (
     odometry_noise,
     position_variance,
 )
-from coopenv.observers.robust.belief import index_of
+from coopenv.observers.robust.joint_state import index_of, mounting_of, mounting_variances
 from coopenv.observers.robust.memory import MOUNTING, BearingFrame, Derivative, Pose, mat26d, mat66d, vec3d
 from coopenv.observers.robust.messages import is_circular
-from coopenv.observers.robust.propagation import mounting_of, mounting_variances
 from coopenv.observers.robust.sources import is_excluded, slot_of, take_slot
 from coopenv.world.camera import VISIBLE, body_bearing, mapped_position
 from coopenv.world.nearby import agent_of, box_of_entry, entry_at, entry_count

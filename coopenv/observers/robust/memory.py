@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.base.format import LARGEST
+from coopenv.base.sections import LARGEST
 from coopenv.estimation.poses import are_covariances
 from coopenv.observers.robust.constants import MAX_CORRELATIONS, MAX_HYPOTHESES, MAX_MEMBERS, STEPS
 from coopenv.world.state import COVARIANCE, FLAG, LEAST_EIGENVALUE, ROTATION, TICK, Rule, array, numbers, whole
@@ -71,13 +71,13 @@ class Member:
     velocity_variance: wp.float64  # (m/s)^2 per axis, of v
     seen_tick: wp.int32  # when it was last in view
     report: SenderReport  # its last one, at which it stands
-    source: wp.int32  # the slot of a sender's monitor, see source_monitor.py
+    source: wp.int32  # the slot of a sender's monitor, see integrity.py
     correlation_unknown: wp.int32  # whether it is an earlier source of information whose correlation is not known
 
 
 @wp.struct
 class Source:
-    """A source of information and the monitor of its fault f, see source_monitor.py."""
+    """A source of information and the monitor of its fault f, see integrity.py."""
 
     target: wp.int32  # a landmark, or the number of landmarks plus a vehicle; -1: none
     seen_tick: wp.int32  # when it was last in view
@@ -107,7 +107,7 @@ class JointBelief:
     has_sample: wp.int32  # whether there has been a tick
     sample_v: vec3d  # m/s, body: the odometry sample held at the last tick's end
     sample_w: vec3d  # rad/s, body
-    mean_v: vec3d  # m/s, body: of the samples of late, see propagation.py
+    mean_v: vec3d  # m/s, body: of the samples of late, see joint_state.py
     members: wp.int32  # how many
     first_sender: wp.int32  # the first of them that is another vehicle; before it the calibration states
     depends_on: wp.uint64  # bits of vehicles
@@ -259,8 +259,8 @@ class RobustMemory:
     factor: array("WLKK", mat66d)  # blocks of a Cholesky factor, on its diagonal their inverses
 
 
-ERRORS = 1  # the member that stands for the odometry's errors, where there is one, see propagation.py
-MOUNTING = 2  # the member that stands for the error of the camera's mounting, where there is one, see propagation.py
+ERRORS = 1  # the member that stands for the odometry's errors, where there is one, see joint_state.py
+MOUNTING = 2  # the member that stands for the error of the camera's mounting, where there is one, see joint_state.py
 DERIVATIVES = 3  # the most errors that a bearing depends on
 SENDER_SLOTS, LANDMARK_SLOTS = MAX_MEMBERS - 1, 4
 SOURCES = 3 + SENDER_SLOTS + LANDMARK_SLOTS

@@ -33,18 +33,24 @@ from coopenv.observers.robust.algebra import (
     odometry_noise,
     with_noise,
 )
-from coopenv.observers.robust.belief import (
-    apply_error,
-    begin_belief,
-    estimate_with_faults,
-    own_estimate,
-    set_anchor,
-    set_block,
-)
 from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.correlated_fusion import fuse_messages
 from coopenv.observers.robust.correlations import clear_broadcasts, receive_broadcast, send_broadcast
 from coopenv.observers.robust.fault_hypotheses import detect_and_exclude, test_excluded
+from coopenv.observers.robust.integrity import correct_sources, protection_level
+from coopenv.observers.robust.joint_state import (
+    apply_error,
+    begin_belief,
+    begin_errors,
+    estimate_with_faults,
+    increment_noise,
+    own_estimate,
+    propagate_own,
+    set_anchor,
+    set_block,
+    take_odometry,
+    walk_errors,
+)
 from coopenv.observers.robust.measurements import RESECTION, TRACKING, innovation_squared, set_bearing_measurements
 from coopenv.observers.robust.memory import (
     ROBUST_SIZES,
@@ -61,16 +67,7 @@ from coopenv.observers.robust.memory import (
     vec6d,
 )
 from coopenv.observers.robust.messages import ROBUST_MESSAGES, bit_of
-from coopenv.observers.robust.propagation import (
-    begin_errors,
-    increment_noise,
-    propagate_own,
-    take_odometry,
-    walk_errors,
-)
-from coopenv.observers.robust.protection import protection_level
 from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
-from coopenv.observers.robust.source_monitor import correct_sources
 from coopenv.observers.robust.sources import begin_sources, is_excluded
 from coopenv.world.embedded import Embedded
 from coopenv.world.nearby import is_target

@@ -17,8 +17,8 @@ from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.p3p import camera_pose, solve_triangle
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import carried, distance_squared, inverse6, is_known, is_regular
-from coopenv.observers.robust.belief import begin_belief, own_estimate
 from coopenv.observers.robust.correction import iterated_update
+from coopenv.observers.robust.joint_state import begin_belief, own_estimate
 from coopenv.observers.robust.measurements import (
     SEARCH,
     frames_in,

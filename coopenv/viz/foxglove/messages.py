@@ -21,7 +21,7 @@ from coopenv.estimation.poses import Array, covariance_in_map
 from coopenv.observers import Run
 from coopenv.observers.recording import Recording
 from coopenv.scenario.bodies import Body
-from coopenv.viz.camera_image import pixels
+from coopenv.viz.perspective import pixels
 from coopenv.viz.scene import semi_axes
 from coopenv.viz.stage import Stage, roads, ways
 from coopenv.viz.style import DARK_BLUE, INK, vehicle_colour

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.format import fixed
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 from coopenv.estimation.poses import error_dof
-from coopenv.viz.camera_image import camera_image
 from coopenv.viz.error_figures import nees_bounds
+from coopenv.viz.meshes import Look
+from coopenv.viz.perspective import camera_image
 from coopenv.viz.scene import Frame, Origin, semi_axes
 from coopenv.viz.stage import Stage, vehicle_mark
 from coopenv.viz.style import BLUE, DARK_BLUE, GREY, INK, VEHICLE_COLOURS, VERMILION, vehicle_colour
 from coopenv.viz.topview_ground import TRAFFIC
-from coopenv.viz.web.ground import Look
 
 LONGEST = 600
 """Frames in a plot."""

@@ -6,13 +6,9 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.format import fixed
-from coopenv.estimation.outcomes import Outcome, Sight
+from coopenv.estimation import Outcome, Sight
 from coopenv.viz import meshes
-from coopenv.viz.scene import Frame, Origin, semi_axes
-from coopenv.viz.stage import Box, Stage, entries, vehicle_mark
-from coopenv.viz.style import DARK_BLUE, GREY, INK, rgb, vehicle_colour
-from coopenv.viz.topview_ground import TRAFFIC
-from coopenv.viz.web.ground import (
+from coopenv.viz.meshes import (
     NOTHING,
     ROOT,
     Batch,
@@ -25,6 +21,10 @@ from coopenv.viz.web.ground import (
     placed,
     update,
 )
+from coopenv.viz.scene import Frame, Origin, semi_axes
+from coopenv.viz.stage import Box, Stage, entries, vehicle_mark
+from coopenv.viz.style import DARK_BLUE, GREY, INK, rgb, vehicle_colour
+from coopenv.viz.topview_ground import TRAFFIC
 
 _SHELL = 1.08  # size of an estimate: around the true vehicle, so that both are seen where they agree
 _LARGEST = 0.5  # of the scene's side, largest semi-axis of an ellipsoid that is drawn

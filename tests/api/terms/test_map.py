@@ -10,7 +10,7 @@ import pytest
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import observation_layout
-from coopenv.estimation.outcomes import Sight
+from coopenv.estimation import Sight
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.four_way import FOUR_WAY
 from tests.oracles.geometry import in_field_of_view, is_occluded, point_in_camera

@@ -18,8 +18,8 @@ from coopenv.api.terms.records import Ego, Target, TruthRecord
 from coopenv.base.errors import CoopenvError, ScenarioError
 from coopenv.base.installation import scenario_path
 from coopenv.cli import main
+from coopenv.estimation import Outcome
 from coopenv.estimation.observability import Trajectory
-from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario.terms import REWARD_TERMS
 from tests.helpers.four_way import FOUR_WAY
 

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 import coopenv
 import coopenv.observers.registry as registry
 from coopenv.observers import Estimate, register
-from coopenv.observers.single_frame import DeadReckoning
+from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.four_way import FOUR_WAY

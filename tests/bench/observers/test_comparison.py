@@ -30,7 +30,7 @@ from coopenv.bench.observers.tables import everything, failures
 from coopenv.cli.bench import ObserverOptions
 from coopenv.observers import registry, run
 from coopenv.observers.contract import Estimate, Tick
-from coopenv.observers.single_frame import DeadReckoning
+from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.runs.recorder import record
 from coopenv.viz.figures import COLUMNS
 from tests.helpers import mrclam_files
@@ -86,7 +86,7 @@ class Tells(DeadReckoning):
 
 
 SOURCE = """
-from coopenv.observers.single_frame import DeadReckoning
+from coopenv.observers.pose_filters import DeadReckoning
 
 class Mine(DeadReckoning):
     pass

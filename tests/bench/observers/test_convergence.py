@@ -27,7 +27,7 @@ from coopenv.bench.observers.convergence import (
 )
 from coopenv.cli import main
 from coopenv.observers import Estimate, Recording, Tick, find, run
-from coopenv.observers.single_frame import DeadReckoning
+from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.runs import rollout
 from coopenv.runs.recorder import record
 from tests.helpers.commands import printed, refused

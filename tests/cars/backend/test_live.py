@@ -21,7 +21,7 @@ from coopenv.cars.backend.drive import Drive
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.fake.car import Fake
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.transport.base import Arrival
+from coopenv.cars.transport import Arrival
 from tests.helpers.cars import OVERTAKING, PATIENT, cars, fakes, send_fault, write_fleet
 from tests.helpers.hub import Hub
 

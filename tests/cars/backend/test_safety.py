@@ -12,18 +12,18 @@ import pytest
 
 from coopenv.backends.base import VehicleBroadcast
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend import status
+from coopenv.cars.backend import buffers
 from coopenv.cars.backend.assembler import Assembler
+from coopenv.cars.backend.buffers import StatusBoard
 from coopenv.cars.backend.station import LATE, Gates, Station
-from coopenv.cars.backend.status import StatusBoard
 from coopenv.cars.backend.watchdog import BEARING_STD, LinkMonitor, Watchdog, bearing_nis
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.deployment import Remote, Safety
-from coopenv.cars.gate.core import Gate, GateClock
-from coopenv.cars.gate.process import GateConnection
+from coopenv.cars.gate import Gate, GateClock
+from coopenv.cars.gate_process import GateConnection
 from coopenv.cars.profile import SVEA, USUAL, Role
 from coopenv.cars.readings import CarPose, Sample, Twist
-from coopenv.cars.transport.base import Arrival
+from coopenv.cars.transport import Arrival
 from coopenv.cars.vision import Calibration
 from coopenv.estimation.poses import exp_so3
 from tests.cars.backend.test_assembler import binding
@@ -286,7 +286,7 @@ def test_a_gate_that_does_not_open_says_why(yard: Yard) -> None:
 
 
 def refuse(*_message: object) -> None:
-    from coopenv.cars.gate.core import Reason, Rejected
+    from coopenv.cars.gate import Reason, Rejected
 
     raise Rejected(Reason.SIGNATURE)
 
@@ -412,9 +412,9 @@ def test_what_has_been_said_counts_for_two_seconds(monkeypatch: pytest.MonkeyPat
     talk, now = Talk(), time.monotonic()
     talk.all_is_well()
     talk.board.begin()
-    monkeypatch.setattr(status.time, "monotonic", lambda: now + 1.5)
+    monkeypatch.setattr(buffers.time, "monotonic", lambda: now + 1.5)
     assert talk.obstacle() == talk.board.happened(CAR) == ""
-    monkeypatch.setattr(status.time, "monotonic", lambda: now + 2.5)
+    monkeypatch.setattr(buffers.time, "monotonic", lambda: now + 2.5)
     assert talk.obstacle().endswith(SVEA.topic_of(CAR, Role.STATE))
     assert talk.board.happened(CAR)
 

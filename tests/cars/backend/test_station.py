@@ -17,14 +17,14 @@ from scipy.linalg import expm
 from coopenv.cars.backend import station as module
 from coopenv.cars.backend.assembler import Assembler, Intake
 from coopenv.cars.backend.binding import Binding, bind
+from coopenv.cars.backend.buffers import KEPT, MOST_SAMPLES, Odometer, PlaceTrack
 from coopenv.cars.backend.station import MOST_WAITING, Pacer, Station
-from coopenv.cars.backend.tracks import KEPT, MOST_SAMPLES, Odometer, PlaceTrack
 from coopenv.cars.codec import MOST_BYTES, encode, header, make
 from coopenv.cars.deployment import Car, Sensors
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.readings import Twist
-from coopenv.cars.transport.base import Arrival
+from coopenv.cars.transport import Arrival
 from coopenv.scenario import load_scenario
 from tests.helpers.hub import Hub
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from coopenv.base.errors import DataError
+from coopenv.cars.calibration import Calibrated, calibrate, toml_text
 from coopenv.cars.calibration.drives import CarDrive, Drive
-from coopenv.cars.calibration.findings import Calibrated, calibrate, toml_text
 from coopenv.cars.vision import Calibration, rays
 from coopenv.cli import main
 from coopenv.scenario import load_scenario

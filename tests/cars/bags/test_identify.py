@@ -11,7 +11,7 @@ import pytest
 
 from coopenv.cars.calibration.response import KINDS, Response, constants_of
 from coopenv.cars.deployment import load_deployment
-from coopenv.cars.fake.faults import FakeSettings
+from coopenv.cars.fake import FakeSettings
 from coopenv.cars.profile import SVEA
 from coopenv.cli import main
 from tests.helpers import bags

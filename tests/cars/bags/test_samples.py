@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from coopenv.cars.bags import Bag
-from coopenv.cars.bags.doctor import cars_of, examined, proposed
+from coopenv.cars.bags import Bag, cars_of, examined, proposed
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.log import TopicRow
 from coopenv.cars.bags.topic_map import load_map

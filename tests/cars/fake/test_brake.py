@@ -6,7 +6,7 @@ import pytest
 from pydantic import ValidationError
 
 from coopenv.cars.deployment import Safety
-from coopenv.cars.gate.core import PERIOD, Gate, GateClock, read_drive
+from coopenv.cars.gate import PERIOD, Gate, GateClock, read_drive
 from coopenv.cars.profile import NEUTRAL, SVEA, Brake, CarProfile, Limits, MotionCommand, Role
 from tests.cars.link.gate import messages
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from coopenv.backends.base import Command
-from coopenv.backends.simulated import Simulated
+from coopenv.backends.worlds import Simulated
 from coopenv.cars.codec import stamp_of
 from coopenv.cars.deployment import Sensors
 from coopenv.cars.profile import Role

@@ -16,7 +16,7 @@ import pytest
 import coopenv
 from coopenv.cars.codec import decode
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.transport.base import Arrival
+from coopenv.cars.transport import Arrival
 from coopenv.cars.transport.zenoh import open_zenoh
 from tests.helpers.cars import OVERTAKING
 from tests.helpers.processes import COOPENV, started, wait_until

@@ -26,10 +26,10 @@ from coopenv.cars.codec import MOST_BYTES, encode, make
 from coopenv.cars.deployment import DeploymentError, load_deployment
 from coopenv.cars.fake.fleet import FakesError, free_port
 from coopenv.cars.fake.fleet import fakes as fake_processes
-from coopenv.cars.gate.core import write_status
+from coopenv.cars.gate import write_status
 from coopenv.cars.keys import load_signer, load_verifier, make_keys
 from coopenv.cars.profile import SVEA, Limits, Role, presence_of
-from coopenv.cars.transport.base import Arrival
+from coopenv.cars.transport import Arrival
 from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cli import app
 from coopenv.cli.svea import next_message

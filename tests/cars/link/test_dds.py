@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from coopenv.cars import codec
-from coopenv.cars.gate.core import write_drive
+from coopenv.cars.gate import write_drive
 from coopenv.cars.profile import SVEA, CarProfile, MotionCommand, Role, load_profile
-from coopenv.cars.transport.base import Arrival
+from coopenv.cars.transport import Arrival
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 
 pytest.importorskip("cyclonedds", reason="needs cyclonedds, which has no wheel for this platform")

@@ -17,10 +17,10 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.attack import Intruder, attack
 from coopenv.cars.backend.station import OLD, Gates, neutral_command
 from coopenv.cars.deployment import parse_deployment
-from coopenv.cars.gate.core import write_drive
+from coopenv.cars.gate import write_drive
 from coopenv.cars.keys import load_signer, make_keys
 from coopenv.cars.profile import SVEA, USUAL, MotionCommand, Role
-from coopenv.cars.transport.base import Tls
+from coopenv.cars.transport import Tls
 from coopenv.cars.transport.zenoh import Zenoh, open_zenoh
 from tests.cars.link.gate.bench import CAR
 from tests.cars.link.gate.station import Station, running_gate

@@ -13,7 +13,7 @@ from coopenv.backends.mrclam import recording_of
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Coordinates
 from coopenv.observers.contract import Gains, Message, Received, SensorNoise, Setup, Tick
-from coopenv.observers.planar.plugin import PlanarEkf, PlanarRobust
+from coopenv.observers.planar import PlanarEkf, PlanarRobust
 from coopenv.observers.runner import run
 from tests.helpers.mrclam_files import barrier_robots, carried_off
 from tests.helpers.recordings import Tampering, completed

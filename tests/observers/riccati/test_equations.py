@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 import coopenv
 from coopenv.base.errors import world_keys
 from coopenv.estimation import linalg
-from coopenv.observers.riccati import kernels
-from coopenv.observers.riccati.gradient import DifferentiableWorld, check_differentiable, tick_intervals
+from coopenv.observers import riccati as kernels
+from coopenv.observers.riccati_gradient import DifferentiableWorld, check_differentiable, tick_intervals
 from coopenv.scenario import Scenario
 from tests.helpers.builders import simulate
 from tests.helpers.four_way import FOUR_WAY

@@ -12,7 +12,7 @@ from coopenv.api.engine import Engine
 from coopenv.estimation.poses import position_covariance
 from coopenv.observers import registry
 from coopenv.observers import run as run_observer
-from coopenv.observers.single_frame import DeadReckoning
+from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.world.world import World

@@ -17,7 +17,7 @@ from coopenv.observers import run
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.registry import find
 from coopenv.observers.robust.constants import RISK
-from coopenv.observers.robust.protection import QUANTILE, fault_variances, levels, own_variances
+from coopenv.observers.robust.integrity import QUANTILE, fault_variances, levels, own_variances
 from tests.helpers.recordings import completed
 from tests.helpers.robust_ticks import OpenRobust
 from tests.helpers.robust_worlds import everybody_sees_everybody, noise_free, small_errors

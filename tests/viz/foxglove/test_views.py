@@ -228,7 +228,7 @@ def test_projected_targets_are_where_the_camera_measured_them(crossing: Any) -> 
 
 
 def test_distortion_moves_the_targets() -> None:
-    from coopenv.viz.camera_image import pixels
+    from coopenv.viz.perspective import pixels
 
     rays = np.array([[0.3, 0.2, 0.9], [0.0, 0.0, 1.0], [0.1, 0.1, -0.5]])
     straight = pixels(rays, Camera(model="pinhole"))

@@ -10,7 +10,7 @@ from typing import Any
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from coopenv.cars.codec import decode, stamp_of
-from coopenv.cars.gate.core import PERIOD, Gate, GateClock, Reason, read_drive
+from coopenv.cars.gate import PERIOD, Gate, GateClock, Reason, read_drive
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.profile import SVEA, Limits, MotionCommand, Role
 from tests.cars.link.gate import messages

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from coopenv.cars.codec import decode
-from coopenv.cars.gate.core import Malformed, read_drive
+from coopenv.cars.gate import Malformed, read_drive
 from coopenv.cars.keys import Signer
 from coopenv.cars.profile import SVEA, MotionCommand, Role, presence_of
-from coopenv.cars.transport.base import Transport
+from coopenv.cars.transport import Transport
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR
 from tests.helpers.processes import COOPENV, started, wait_until

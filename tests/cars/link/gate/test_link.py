@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import decode, encode, header, make
-from coopenv.cars.gate.core import (
+from coopenv.cars.gate import (
     ARM,
     BOOL,
     COMMAND,
@@ -29,7 +29,7 @@ from coopenv.cars.gate.core import (
     write_drive,
     write_status,
 )
-from coopenv.cars.gate.process import CLOCK, GateConnection, run
+from coopenv.cars.gate_process import CLOCK, GateConnection, run
 from coopenv.cars.profile import NEUTRAL, SVEA, MotionCommand, Role
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR, LIMITS, OTHER, STATION, Bench, messages_of_strangers

@@ -17,10 +17,9 @@ from coopenv.cars.codec import decode, encode, header, make, ros1
 from coopenv.cars.deployment import Car, DeploymentError
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.readings import CarPose, read
-from coopenv.cars.transport.authors import Authors, routes_of
-from coopenv.cars.transport.base import Arrival, Transport, matcher
+from coopenv.cars.transport import Arrival, Transport, matcher
 from coopenv.cars.transport.nats import open_nats
-from coopenv.cars.transport.ros1 import open_ros1
+from coopenv.cars.transport.ros1 import Authors, open_ros1, routes_of
 from coopenv.cars.transport.zenoh import open_zenoh
 from tests.helpers.brokers import nats_server, ros_master
 from tests.helpers.hub import Hub, HubTransport

@@ -15,11 +15,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from coopenv.cars import transport
 from coopenv.cars.codec import encode, make
 from coopenv.cars.deployment import parse_deployment
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.transport import base
-from coopenv.cars.transport.base import LEASE, HeartbeatTransport, LinkError, matcher
+from coopenv.cars.transport import LEASE, HeartbeatTransport, LinkError, matcher
 from coopenv.cars.transport.nats import (
     MOST_WAITING,
     Letter,
@@ -206,7 +206,7 @@ class End(HeartbeatTransport):
 
 def test_a_name_is_there_while_any_of_its_ends_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr(base.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(transport.time, "monotonic", lambda: now[0])
     watcher = End()
     ends = [End(watcher) for _ in range(2)]
     seen = seen_by(watcher)  # type: ignore[arg-type]

@@ -21,8 +21,7 @@ from coopenv.cars.codec import decode, encode, header, make
 from coopenv.cars.codec import ros1 as types_of_ros1
 from coopenv.cars.deployment import parse_deployment
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.transport import ros1
-from coopenv.cars.transport.base import Address, LinkError
+from coopenv.cars.transport import Address, LinkError, ros1
 from coopenv.cars.transport.ros1 import ENVELOPE, open_ros1, opened, sealed
 from coopenv.cars.transport.zenoh import open_transport
 from tests.helpers.brokers import ros_master

@@ -16,7 +16,7 @@ import pytest
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.deployment import Deployment, DeploymentError, parse_deployment
-from coopenv.cars.transport.base import Address, Arrival, LinkError, address_of
+from coopenv.cars.transport import Address, Arrival, LinkError, address_of
 from coopenv.cars.transport.zenoh import Zenoh, open_transport, open_zenoh
 from tests.helpers.brokers import Authority
 from tests.helpers.processes import wait_until

@@ -1,4 +1,7 @@
-"""The decisions of the gate, without threads, clocks or a network of its own, and its few messages as CDR.
+"""The gate on a car's own computer: the only process that commands the wheels.
+
+These are its decisions, without threads, clocks or a network of its own, and its few messages as CDR; gate_process.py
+connects it to the network. It starts quickly and needs neither NumPy nor the simulation.
 
 It starts disarmed. An arming by the station names a session and the nonce that the gate has shown last; the nonce is a
 new one after every start, arming, disarming and stop, so that an arming counts once, and only if its sender knew of

@@ -19,15 +19,15 @@ import warp as wp
 
 from coopenv.base.errors import ActionError, ScenarioError, ScenarioWarning, world_keys
 from coopenv.estimation.linalg import block3, cholesky6, exp_so3, increment, join6, orthonormalise
-from coopenv.observers.riccati.kernels import accumulate_information, correct_kalman, predict_covariance, predict_pose
+from coopenv.observers.riccati import accumulate_information, correct_kalman, predict_covariance, predict_pose
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets, processing_order
 from coopenv.world import launch
 from coopenv.world.camera import VISIBLE, marker_position, sight_of
-from coopenv.world.cells import sort_into_cells
 from coopenv.world.dynamics import LONGEST_SUBSTEP, bicycle_step, command_of, prescribe, yaw_rate
 from coopenv.world.launch import kernel
 from coopenv.world.model import PRESCRIBED, precision
+from coopenv.world.nearby import sort_into_cells
 from coopenv.world.world import World
 
 scalar, vec2, vec3, vec4, mat33, mat66 = (

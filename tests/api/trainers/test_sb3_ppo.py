@@ -16,8 +16,8 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 import coopenv
-from coopenv.training import ppo
-from coopenv.training.ppo import product
+from coopenv.api.trainers import sb3
+from coopenv.api.trainers.sb3 import product
 from coopenv.training.settings import Ppo, Settings, TrainingPlan
 from coopenv.training.trainer import Trainer
 from tests.helpers.four_way import FOUR_WAY
@@ -90,9 +90,9 @@ def test_an_update_is_that_of_sb3(ppo: dict[str, Any]) -> None:
 @pytest.mark.parametrize("available", [True, False])
 def test_products_are_those_of_float64(available: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of transposed views as well, with oneDNN and without."""
-    if available and not (ppo.ONEDNN and torch.backends.mkldnn.is_available()):
+    if available and not (sb3.ONEDNN and torch.backends.mkldnn.is_available()):
         pytest.skip("this torch has no oneDNN")
-    monkeypatch.setattr(ppo, "onednn_pays", lambda: available)
+    monkeypatch.setattr(sb3, "onednn_pays", lambda: available)
     rng = np.random.default_rng(1)
     rows, weight, bias = (torch.from_numpy(rng.normal(size=n).astype(np.float32)) for n in ((300, 40), (9, 40), 9))
     exact = rows.double() @ weight.double().t()
@@ -108,11 +108,11 @@ def test_products_are_those_of_float64(available: bool, monkeypatch: pytest.Monk
 def test_onednn_multiplies_on_amd_alone(
     processor: str | None, built: bool, pays: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ppo, "CPUINFO", tmp_path / "cpuinfo")
-    monkeypatch.setattr(ppo, "ONEDNN", print)
+    monkeypatch.setattr(sb3, "CPUINFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr(sb3, "ONEDNN", print)
     monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: built)
     if processor is not None:
-        ppo.CPUINFO.write_text(f"vendor_id\t: {processor}\n")
-    ppo.onednn_pays.cache_clear()
-    assert ppo.onednn_pays() is pays
-    ppo.onednn_pays.cache_clear()
+        sb3.CPUINFO.write_text(f"vendor_id\t: {processor}\n")
+    sb3.onednn_pays.cache_clear()
+    assert sb3.onednn_pays() is pays
+    sb3.onednn_pays.cache_clear()

@@ -1,4 +1,4 @@
-"""A sub-dataset as a `Recording`: recorded robots on regular ticks, in the form that every observer runs on.
+"""A sub-dataset of MR.CLAM as a `Recording`: five robots with odometry and cameras, and motion capture that judges.
 
 Five planar vehicles (z = 0, yaw only) among 15 landmarks. Ticks are 0.05 s apart; tick 0 is the first odometry sample
 of any robot. A camera frame counts at the next tick; its bearings are turned by the odometry's rotation in between.
@@ -15,12 +15,15 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.backends.mrclam.dataset import MAX_TRUTH_GAP_S, ROBOTS, Dataset, HeldCommands, Robot, arc
+from coopenv.backends.mrclam_dataset import MAX_TRUTH_GAP_S, ROBOTS, Dataset, HeldCommands, Robot, arc, load_dataset
 from coopenv.base.errors import DataError, suggest
 from coopenv.estimation.poses import Array, about_z
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.planar.model import ARC, CALIBRATING, IROBOT_CREATE, PATH, SLOWING, TURN, TURNING, CommandHistory
 from coopenv.observers.recording import Recording, Truth, check_recording
+
+__all__ = ["VARIANTS", "Dataset", "Variant", "load_dataset", "recording_of"]
+
 
 Variant = Literal["landmarks", "landmarks+robots", "blind"]
 VARIANTS: tuple[Variant, ...] = get_args(Variant)

@@ -14,10 +14,10 @@ from typing import Any
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.deployment import Car, Deployment, load_deployment
-from coopenv.cars.gate.core import PERIOD, Gate, GateClock, GateMode, Malformed, read_drive, write
+from coopenv.cars.gate import PERIOD, Gate, GateClock, GateMode, Malformed, read_drive, write
 from coopenv.cars.keys import Signer, check_identity, load_keys
 from coopenv.cars.profile import NEUTRAL, Role, presence_of
-from coopenv.cars.transport.base import SECURE, Arrival, Transport, address_of
+from coopenv.cars.transport import SECURE, Arrival, Transport, address_of
 
 CLOCK = GateClock(time.time_ns, time.monotonic_ns)
 TICKS_PER_STATUS = 4  # 5 Hz

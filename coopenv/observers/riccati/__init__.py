@@ -1,1 +1,0 @@
-"""The Riccati observer of the paper: kernels with its equations, plug-in, derivatives."""
