@@ -18,7 +18,7 @@ from coopenv.evaluation import Difference, Episodes, compare_paired, drive, held
 from coopenv.policies import load_agent
 from coopenv.scenario import load_scenario
 from coopenv.scenario.learning import Difficulty
-from tests.helpers.env_suite import LARGEST, largest_slow
+from tests.helpers.env_suite import LARGEST, rest_slow
 
 pytestmark = pytest.mark.headroom
 
@@ -49,7 +49,7 @@ def change_of_time(environment: str, times: int = 2) -> Difference:
     return next(each for each in compare_paired(*of) if each.metric == "travel_time_s")
 
 
-@pytest.mark.parametrize("environment", largest_slow(WORLDS))
+@pytest.mark.parametrize("environment", rest_slow(WORLDS, 1))
 def test_a_lookout_knows_far_better_where_it_is_and_loses_little_time(environment: str) -> None:
     straight, lookout = figures(environment, "route_follower"), figures(environment, "peek")
     assert lookout["e95_m"][0] <= 0.5 * straight["e95_m"][0]
@@ -182,7 +182,7 @@ def test_many_worlds_show_how_little_time_is_lost(environment: str) -> None:
     assert change_of_time(environment, 15 if environment in LARGEST else 30).relative <= MOST_TIME
 
 
-@pytest.mark.parametrize("environment", largest_slow(WORLDS))
+@pytest.mark.parametrize("environment", rest_slow(WORLDS, 1))
 def test_errors_depend_on_what_is_sensed(environment: str) -> None:
     sensed = figures(environment, "route_follower")
     ideal, blind = (figures(environment, "route_follower", how, 1) for how in ("ideal", "blind"))

@@ -203,6 +203,10 @@ def first_episodes(
     return returned, length, infos["ended"]
 
 
+ALIKE = ("broken_camera", "busy_intersection_mirror", "busy_intersection_tracking", "city", "highway_intersection")
+ALIKE += ("large_crossing", "liar_among_us", "overtaking", "scout_platoon", "take_turns")
+"""Environments whose files use what those of others use, too; the quick tests do without them."""
+
 LARGEST = ("large_crossing", "urban_crossing")
 """Environments whose figures take longest; the quick tests do without them where others ask the same."""
 
@@ -213,6 +217,11 @@ def rest_slow(values: Iterable[Any], *kept: int) -> list[Any]:
     return [pytest.param(*row, marks=() if n in kept else pytest.mark.slow) for n, row in enumerate(rows)]
 
 
+def each_slow(environments: Iterable[str], *slow: str) -> list[Any]:
+    """Return environments as parameters, some of them marked slow."""
+    return [pytest.param(name, marks=pytest.mark.slow) if name in slow else name for name in environments]
+
+
 def largest_slow(environments: Iterable[str]) -> list[Any]:
     """Return environments as parameters, the largest ones marked slow."""
-    return [pytest.param(name, marks=pytest.mark.slow) if name in LARGEST else name for name in environments]
+    return each_slow(environments, *LARGEST)

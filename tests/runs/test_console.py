@@ -31,6 +31,7 @@ from coopenv.scenario.bodies import ConstantMotion, InitialEstimate, SegmentMoti
 from coopenv.scenario.files import apply_vehicle_defaults, schema_text
 from coopenv.world import launch
 from tests.helpers.commands import printed
+from tests.helpers.env_suite import ALIKE, each_slow
 from tests.helpers.four_way import FOUR_WAY
 
 
@@ -193,7 +194,7 @@ def described(name: str, width: int, **overrides: Any) -> str:
     return printed(*describe_scenario(coopenv.load_scenario(name, overrides)), width=width)
 
 
-@pytest.mark.parametrize("name", coopenv.list_envs())
+@pytest.mark.parametrize("name", each_slow(coopenv.list_envs(), *ALIKE))
 def test_everything_fits_and_nothing_is_cut_off(name: str) -> None:
     text = described(name, 80)
     assert max(len(line.rstrip()) for line in text.splitlines()) <= 80

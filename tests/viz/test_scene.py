@@ -27,6 +27,7 @@ from coopenv.viz.topview import TopView
 from coopenv.viz.web import write_replay
 from coopenv.viz.web.panel import GAIN, table_html
 from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, first_look, level_lines, levels, stopped
+from tests.helpers.env_suite import ALIKE, each_slow
 
 ALONG = np.array([40.0, 0.0, 0.0])
 
@@ -232,7 +233,7 @@ def test_a_gain_is_not_called_a_covariance_and_titles_bring_no_code_along(tmp_pa
     assert "<script>alert" not in page and "&lt;script&gt;alert(1)&lt;/script&gt; &amp; more" in page
 
 
-@pytest.mark.parametrize("name", coopenv.list_envs())
+@pytest.mark.parametrize("name", each_slow(coopenv.list_envs(), *ALIKE))
 def test_every_environment_can_be_drawn(name: str, tmp_path: Path) -> None:
     path = write_replay(scene(name, horizon=1.0), tmp_path / "replay.html")
     length, _ = messages(path.read_text(encoding="utf-8"))

@@ -25,18 +25,12 @@ from coopenv.scenario import load_scenario
 from coopenv.scenario.sensing import Camera
 from coopenv.viz.perspective import Lens, _before, camera_image, pixels
 from coopenv.viz.scene import Frame
-from coopenv.viz.stage import (
-    Box,
-    Stage,
-    camera_fan,
-    ellipses,
-    free_lengths,
-    limits,
-)
+from coopenv.viz.stage import Box, Stage, camera_fan, ellipses, free_lengths, limits
 from coopenv.viz.style import ORANGE, vehicle_colour
 from coopenv.viz.topview import TopView
 from coopenv.viz.topview_ground import HEIGHT, MAP_WIDTH, PANEL, ROW, TABLE_TOP, WIDTH, touching
 from tests.helpers.builders import scenario
+from tests.helpers.env_suite import ALIKE, each_slow
 from tests.helpers.four_way import FOUR_WAY
 
 
@@ -79,11 +73,11 @@ def assert_colour(rgb: np.ndarray, name: str) -> None:
     np.testing.assert_allclose(rgb, np.array(to_rgb(name)) * 255, atol=8)
 
 
-@pytest.mark.parametrize("name", coopenv.list_envs())
+@pytest.mark.parametrize("name", each_slow(coopenv.list_envs(), *ALIKE))
 def test_draws_every_environment_and_leaves_its_state_alone(name: str) -> None:
     env = coopenv.parallel_env(name, render_mode="rgb_array")
     env.reset(seed=0)
-    drive(env, 10)
+    drive(env, 3)
     before = env.engine.get_state()
     picture = env.render()
     env.state()
@@ -261,21 +255,28 @@ def test_field_of_view_ends_at_walls() -> None:
     np.testing.assert_allclose(length, [[4.0, 8.0, 8.0, 8.0]])
 
 
-@pytest.mark.parametrize("backend", [None, "tkagg", "module://no_such_backend"])
-def test_show_without_a_display_is_silent(backend: str | None) -> None:
+def test_show_without_a_display_is_silent() -> None:
+    """With each setting of Matplotlib's backend, in forks of one interpreter in which Matplotlib is not loaded yet."""
     script = (
-        "import sys, matplotlib as mpl, numpy as np\n"
+        "import os, sys\n"
+        "import coopenv.scenario.files, coopenv.estimation.outcomes, coopenv.viz.scene\n"
+        "assert 'matplotlib' not in sys.modules\n"
+        "for backend in (None, 'tkagg', 'module://no_such_backend'):\n"
+        "    if os.fork() == 0: break\n"
+        "    assert os.wait()[1] == 0, backend\n"
+        "else: sys.exit()\n"
+        "os.environ.update({'MPLBACKEND': backend} if backend else {})\n"
+        "import matplotlib as mpl, numpy as np\n"
         "settings = lambda: {k: mpl.rcParams[k] for k in mpl.rcParams if k != 'backend'}\n"
         "before = settings()\n"
         "import coopenv\n"
+        "from coopenv.viz import figures\n"
         "from coopenv.viz.topview import TopView\n"
         "view = TopView(coopenv.load_scenario('crossing_path'))\n"
         "assert 'matplotlib.pyplot' not in sys.modules and settings() == before\n"
         "view.show(np.zeros((4, 6, 3), np.uint8)); view.show(np.zeros((4, 6, 3), np.uint8)); view.close()\n"
     )
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "MPLBACKEND")}
-    if backend:
-        environment["MPLBACKEND"] = backend
     done = subprocess.run(
         [sys.executable, "-W", "error::UserWarning", "-W", "ignore::DeprecationWarning", "-c", script],
         env=environment,
