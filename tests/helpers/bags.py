@@ -94,6 +94,12 @@ def messages(r: Recording) -> list[Message]:
     return found
 
 
+@cache
+def sent() -> tuple[Message, ...]:
+    """Return the messages of the drive of four seconds."""
+    return tuple(messages(drive()))
+
+
 def of_vehicle(
     r: Recording, i: int, names: dict[str, str], numbers: dict[int, int], distortion: tuple[float, ...]
 ) -> list[Message]:

@@ -24,7 +24,7 @@ from coopenv.cars.backend.drive import DriveRecorder
 from coopenv.cars.bags import Bag
 from coopenv.cars.bags.log import Shift, reconcile, recorders, regularity
 from coopenv.cli import main
-from coopenv.observers import run
+from coopenv.observers import Recording, run
 from coopenv.observers.recording import Sensed
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
@@ -39,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bags")
     (folder / "topics.toml").write_text(bags.MAP, encoding="utf-8")
     for form in ("ros1", "sqlite3", "mcap"):
-        bags.write(folder / form, bags.messages(bags.drive()), form)
+        bags.write(folder / form, bags.sent(), form)
     return folder
 
 
@@ -47,6 +47,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def reference(folder: Path) -> list[Sensed]:
     """Ticks of the drive."""
     return ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml"))
+
+
+@pytest.fixture(scope="module")
+def recorded(folder: Path) -> Recording:
+    return record(Bag([folder / "ros1.bag"], folder / "topics.toml"))
 
 
 def open_bag(path: Path, folder: Path, text: str = bags.MAP) -> Bag:
@@ -86,9 +91,8 @@ def test_ticks_are_those_of_the_drive_from_folders_and_from_bare_files(name: str
 
 
 @pytest.mark.parametrize("observer", ["riccati", "robust", "ukf"])
-def test_observers_do_as_well_as_in_the_simulation(observer: str, folder: Path) -> None:
-    recording = record(Bag([folder / "ros1.bag"], folder / "topics.toml"))
-    simulated, replayed = run(observer, bags.drive()), run(observer, recording)
+def test_observers_do_as_well_as_in_the_simulation(observer: str, recorded: Recording) -> None:
+    simulated, replayed = run(observer, bags.drive()), run(observer, recorded)
     assert not replayed.failure
     expected, found = (r.position_rmse(2.8)[0] for r in (simulated, replayed))
     assert expected < 0.05 and abs(found - expected) < 0.2 * expected + 1e-3
@@ -173,7 +177,7 @@ def test_definitions_that_a_bag_lacks_are_known(folder: Path, tmp_path: Path, re
 
 
 def test_two_files_with_clocks_apart_are_as_one(folder: Path, tmp_path: Path, reference: list[Sensed]) -> None:
-    drive = bags.messages(bags.drive())
+    drive = bags.sent()
     captured = [m for m in drive if m.topic.startswith("/qualisys")]
     first = [m for m in drive if m.topic.startswith("/agent8")] + captured
     second = [m for m in drive if m.topic.startswith("/agent7")]
@@ -187,7 +191,7 @@ def test_two_files_with_clocks_apart_are_as_one(folder: Path, tmp_path: Path, re
 
 
 def test_messages_without_stamps_count_when_received(folder: Path, tmp_path: Path, reference: list[Sensed]) -> None:
-    unstamped = [replace(m, stamp=-bags.BEGIN) if "twist" in m.topic else m for m in bags.messages(bags.drive())]
+    unstamped = [replace(m, stamp=-bags.BEGIN) if "twist" in m.topic else m for m in bags.sent()]
     path = bags.write(tmp_path / "unstamped", unstamped, "ros1")
     with pytest.warns(DataWarning, match="actuation_twist: messages without stamps count when they were received"):
         bag = Bag([path], folder / "topics.toml")
@@ -195,7 +199,7 @@ def test_messages_without_stamps_count_when_received(folder: Path, tmp_path: Pat
 
 
 def test_messages_that_make_no_sense_are_left_out(folder: Path, tmp_path: Path, reference: list[Sensed]) -> None:
-    drive = bags.messages(bags.drive())
+    drive = bags.sent()
     nowhere = {"pose": ((np.nan,) * 3, (0.0, 0.0, 0.0, 1.0))}
     broken = [replace(m, fields=nowhere) if m.kind.endswith("PoseStamped") and m.stamp % 7 == 0 else m for m in drive]
     path = bags.write(tmp_path / "broken", broken, "mcap")
@@ -260,7 +264,7 @@ def test_a_tape_of_cars_is_a_bag_too(folder: Path, tmp_path: Path, reference: li
              "/agent8/actuation_twist": "fleet/svea3/mavros/wheel_odometry/velocity",
              "/qualisys/svea3/pose": "fleet/qualisys/svea3/pose",
              "/agent7/riccatiPoint": "fleet/svea1/point"}  # fmt: skip
-    drive = bags.messages(bags.drive())
+    drive = bags.sent()
     path = tmp_path / "recorder.mcap"
     recorder = DriveRecorder(path, b"{}", {names[m.topic]: m.kind for m in drive})
     recorder.tick(0, bags.BEGIN)  # a recorder in which nothing begins leaves no file

@@ -91,7 +91,7 @@ def test_a_bag_of_images_is_estimated_with(tmp_path: Path) -> None:
     calibration = Calibration(camera.image_size, camera.focal_length, camera.principal_point, bags.DISTORTION)
     renderer, C = FrameRenderer(calibration, "tag36h11"), ROTATION_OF_CAMERA["forward"]
     rng = np.random.default_rng(0)
-    given = [m for m in bags.messages(drive) if m.topic != bags.AUTHORS["blocks"]]
+    given = [m for m in bags.sent() if m.topic != bags.AUTHORS["blocks"]]
     width, height = camera.image_size
     for k in range(drive.ticks):
         R, p = drive.truth.rotation[k, 0], drive.truth.position[k, 0]

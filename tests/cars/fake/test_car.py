@@ -21,7 +21,7 @@ SEQUENCE = [(0.4, 0.3, 1.0), (0.25, -0.4, 1.5), (0.05, 0.2, 0.5), (0.5, 0.0, 1.0
 """Speed m/s, steering rad, duration s; the third is within the dead band."""
 
 
-@pytest.mark.parametrize("seed", [0, 5, 2**40 + 1])
+@pytest.mark.parametrize("seed", [5, 2**40 + 1])
 def test_it_starts_where_the_simulator_does(seed: int) -> None:
     stage = Stage("svea_overtaking", OVERTAKING, seed=3)
     stage.drive("svea8", 0.2, 0.1, 1.0)
@@ -106,7 +106,7 @@ def test_errors_that_last_are_the_simulators() -> None:
     stage = Stage("svea_overtaking", OVERTAKING, seed=11)
     simulated = Simulated(stage.scenario)
     simulated.reset(11, {})
-    stage.drive("svea8", 0.2, 0.0, 10.0)
+    stage.drive("svea8", 0.2, 0.0, 5.0)
     scale = simulated._world.view("odometry_scale")[0, 1]
     bias = simulated._world.view("gyro_bias")[0, 1]
     wheel = np.array([m.twist.twist.linear.x for m in stage.arrivals("svea8", Role.WHEEL)[50:]])

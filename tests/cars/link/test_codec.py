@@ -144,12 +144,7 @@ COMMAND = SVEA.command
 
 @pytest.mark.parametrize(
     ("steering", "speed", "y", "z"),
-    [
-        (0.0, 0.0, 0.0, 500.0),
-        (0.2, 0.4, -286.48, 382.35),
-        (-0.2, -0.4, 286.48, 617.65),
-        (1.0, 3.0, -900.0, 50.0),
-    ],
+    [(0.0, 0.0, 0.0, 500.0), (0.2, 0.4, -286.48, 382.35), (-0.2, -0.4, 286.48, 617.65), (1.0, 3.0, -900.0, 50.0)],
 )
 def test_manual_control_has_the_values_of_the_cars_interface(steering: float, speed: float, y: float, z: float) -> None:
     fields = COMMAND.values(MotionCommand(steering, speed))

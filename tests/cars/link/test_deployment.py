@@ -215,7 +215,7 @@ def fleet_file(folder: Path, text: str = FLEET) -> Path:
 
 def test_a_second_make_drives_a_fake_and_is_read(rover: CarProfile) -> None:
     stage = Stage("svea_overtaking", OVERTAKING, EXACT, profile=rover)
-    stage.drive("svea7", 0.3, 0.25, 2.0)
+    stage.drive("svea7", 0.3, 0.25, 1.2)
     truth, wheel = stage.arrivals("svea7", Role.TRUTH)[-1], stage.arrivals("svea7", Role.WHEEL)[-1]
     assert wheel.twist.twist.linear.x == pytest.approx(0.3, abs=1e-3)
     assert truth.twist.twist.angular.z == pytest.approx(0.3 * 0.2553419 / 0.324, abs=1e-2)  # to the left

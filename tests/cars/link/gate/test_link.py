@@ -183,12 +183,7 @@ def test_stops_are_those_of_rosbags(value: bool) -> None:
     assert read(stop(value), BOOL) == [value]
 
 
-@given(
-    STAMP,
-    st.lists(USUAL, min_size=12, max_size=12),
-    st.integers(0, 2**16 - 1),
-    st.integers(0, 255),
-)
+@given(STAMP, st.lists(USUAL, min_size=12, max_size=12), st.integers(0, 2**16 - 1), st.integers(0, 255))
 def test_manual_control_is_that_of_rosbags(stamp: int, numbers: list[float], buttons: int, extensions: int) -> None:
     given = iter([*numbers[:4], buttons, buttons // 2, extensions, *numbers[4:]])
     neutral = {name: (kind, next(given)) for name, (kind, _) in SVEA.command.neutral.items()}
