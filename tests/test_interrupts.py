@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from coopenv.base import interrupts
+from tests.helpers.env_suite import rest_slow
 from tests.helpers.processes import COOPENV, DEADLOCK, group_of, start, wait_until, workers_of
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks at processes in /proc")
@@ -41,7 +42,8 @@ def test_a_run_ends_with_one_line(number: signal.Signals, earlier: bool, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("number", "whole_group"), [(signal.SIGINT, True), (signal.SIGTERM, False), (signal.SIGKILL, False)]
+    ("number", "whole_group"),
+    rest_slow([(signal.SIGINT, True), (signal.SIGTERM, False), (signal.SIGKILL, False)], 0, 2),
 )
 def test_workers_end_with_their_parent(number: signal.Signals, whole_group: bool, tmp_path: Path) -> None:
     process = start(BENCH, tmp_path)

@@ -32,14 +32,7 @@ def modules_after(statement: str) -> set[str]:
 
 
 @pytest.mark.parametrize(
-    "statement",
-    [
-        "import coopenv",
-        "import coopenv.base.errors",
-        "from coopenv.cli import main; main(['--help'])",
-        "from coopenv.cli import main; main(['--version'])",
-        "from coopenv.cli import main; main(['frobnicate'])",
-    ],
+    "statement", ["import coopenv", "from coopenv.cli import main; main(['--version']); main(['frobnicate'])"]
 )
 def test_start_loads_no_simulation(statement: str) -> None:
     loaded = modules_after(statement)
@@ -77,7 +70,10 @@ FORKED = """
 import json, os, sys
 sys.orig_argv[1:3] = ["-m", "coopenv"]  # so that nothing is registered with Gymnasium
 from coopenv.cli import main
-for command in json.loads(sys.argv[1]):
+first, *others = json.loads(sys.argv[1])
+with open(os.devnull, "w") as sys.stdout, open(os.devnull, "w") as sys.stderr:
+    main(first.split())  # loads what the others need as well
+for command in (first, *others):
     if os.fork() == 0:
         with open(os.devnull, "w") as sys.stdout, open(os.devnull, "w") as sys.stderr:
             status = main(command.split())
@@ -119,10 +115,13 @@ WRONG = {
 
 @pytest.fixture(scope="module")
 def ended() -> dict[str, tuple[int, list[str]]]:
-    """Return the status of commands, each in a fork of one interpreter, and the packages that it has loaded."""
-    orders = json.dumps([*LOOKING, *WRONG])
-    result = subprocess.run([sys.executable, "-c", FORKED, orders], stdout=subprocess.PIPE, text=True, check=True)
-    return {command: (status, loaded) for command, status, loaded in map(json.loads, result.stdout.splitlines())}
+    """Return the status of commands, each in a fork of an interpreter, and the packages that both have loaded."""
+    found = {}
+    for orders in ([c for c in WRONG if WRONG[c]], ["describe facade", *LOOKING, *(c for c in WRONG if not WRONG[c])]):
+        program = [sys.executable, "-c", FORKED, json.dumps(orders)]
+        lines = subprocess.run(program, stdout=subprocess.PIPE, text=True, check=True).stdout.splitlines()
+        found |= {command: (status, loaded) for command, status, loaded in map(json.loads, lines)}
+    return found
 
 
 @pytest.mark.parametrize("command", LOOKING)

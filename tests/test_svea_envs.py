@@ -75,15 +75,8 @@ def test_a_camera_that_cars_cannot_have_is_answered_by_what_they_need(
     fleet = ROOT / "examples" / "fleet" / "overtaking.toml"
     assert main(["svea", "run", str(fleet), "--set", f"camera.model={model}"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    for word in (
-        "[camera] of the environment",
-        "pinhole",
-        "image_size",
-        "focal_length",
-        "principal_point",
-        "distortion",
-    ):
-        assert word in line
+    words = ("[camera] of the environment", "pinhole", "image_size", "focal_length", "principal_point", "distortion")
+    assert all(word in line for word in words)
     assert ("got 'ideal'" in line) == (model == "ideal")
 
 

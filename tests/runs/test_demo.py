@@ -268,7 +268,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     """A run of one car alone, and what it has printed."""
     folder, log, out = tmp_path_factory.mktemp("run"), io.StringIO(), io.StringIO()
     path = write_fleet(folder)
-    with fakes(path) as (hub, _):
+    with fakes(path) as (hub, _), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("coopenv.viz.figures.FIGURE_NAMES", ("errors",))
         backend = cars(path, hub, car="svea7", overrides=NEAR)
         try:
             made = Rollout(backend.scenario, 0, policy="route_follower", backend=backend, options={"arm": True})

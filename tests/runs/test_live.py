@@ -33,7 +33,6 @@ from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.processes import small_disk
 
 AT_ONCE = np.inf
-SHORT = {"horizon": 3.0}
 
 
 class Unseen(PictureWindow):
@@ -69,11 +68,11 @@ def test_watching_shows_the_episode_until_the_window_is_closed() -> None:
     def close(window: Unseen, number: int) -> None:
         window.open = number < 5
 
-    scenario, window, closed = coopenv.load_scenario(FOUR_WAY, SHORT), Unseen(), Unseen(close)
+    scenario, window, closed = coopenv.load_scenario(FOUR_WAY, {"horizon": 1.0}), Unseen(), Unseen(close)
     policy = load_agent("route_follower", scenario)
     stage = watch(scenario, policy, 1, console(), window, AT_ONCE)
-    assert len(window.pictures) == 33  # the start is there twice, and so is the end
-    assert (window.pictures[2] != window.pictures[20]).any()
+    assert len(window.pictures) == 13  # the start is there twice, and so is the end
+    assert (window.pictures[2] != window.pictures[10]).any()
     assert stage.outcomes()[0].startswith("vehicle_1: under way, position error 0.0")
     watch(scenario, policy, 1, console(), closed, AT_ONCE)
     assert len(closed.pictures) == 5
@@ -134,10 +133,10 @@ def test_driving_by_hand_again_and_away() -> None:
 
 def test_the_vehicle_goes_where_the_keys_say() -> None:
     window = Unseen(lambda window, number: window.press("up") if number == 2 else None)
-    scenario = coopenv.load_scenario(FOUR_WAY, SHORT)
+    scenario = coopenv.load_scenario(FOUR_WAY, {"horizon": 2.0})
     stage = drive_by_hand(scenario, 1, load_agent("route_follower", scenario), 0, console(), window, AT_ONCE)
     start, now = (stage.engine.view(name)[0, 13] for name in ("start_position", "position"))
-    assert now[1] - start[1] > 1.2 and abs(now[0] - start[0]) < 0.4  # northbound
+    assert now[1] - start[1] > 0.8 and abs(now[0] - start[0]) < 0.4  # northbound
 
 
 def test_without_a_display_one_line_says_so(capsys: pytest.CaptureFixture[str]) -> None:
@@ -153,10 +152,10 @@ def test_a_film_in_place_of_the_window(
 ) -> None:
     monkeypatch.setattr("coopenv.runs.films.find_spec", lambda name: None)
     out = tmp_path / "film"
-    assert main(["watch", "route_follower", "--set", "horizon=2.0", "--out", str(out)]) == 0
+    assert main(["watch", "route_follower", "--set", "horizon=1.0", "--out", str(out)]) == 0
     assert capsys.readouterr().out.count("under way, position error") == 4
     with Image.open(out / "video.gif") as film:
-        assert film.n_frames > 10
+        assert film.n_frames > 5
 
 
 @pytest.mark.parametrize(
@@ -174,7 +173,7 @@ def test_mistakes_are_one_line(options: list[str], message: str) -> None:
 
 @pytest.fixture(scope="module")
 def record() -> SceneRecord:
-    scenario = coopenv.load_scenario("overtaking", {"horizon": 3.0})
+    scenario = coopenv.load_scenario("overtaking", {"horizon": 1.0})
     return scene_of(Engine(scenario), Origin.of("overtaking", scenario, seed=0))
 
 
@@ -189,10 +188,10 @@ def test_a_film_shows_the_frame_that_is_there() -> None:
 @pytest.mark.parametrize("suffix", [".webp", ".gif"])
 def test_a_film_is_the_top_view_in_time(suffix: str, record: SceneRecord, tmp_path: Path) -> None:
     path = tmp_path / f"film{suffix}"
-    assert write_film(top_view_film(record, False), path, fps=5.0, width=448) == 16
+    assert write_film(top_view_film(record, False), path, fps=5.0, width=448) == 6
     with Image.open(path) as film:
-        assert film.n_frames == 16 and film.size[0] == 448
-        film.seek(15)
+        assert film.n_frames == 6 and film.size[0] == 448
+        film.seek(5)
         film.load()
         assert film.info["duration"] == 200
         shown = np.asarray(film.convert("RGB"), float)
@@ -214,7 +213,7 @@ def test_films_stand_side_by_side_with_who_is_lost(record: SceneRecord, tmp_path
     write_film(shots, tmp_path / "film.webp", fps=1.0, width=1304)
     with Image.open(tmp_path / "film.webp") as film:
         picture = np.asarray(film.convert("RGB"), float)
-        assert film.n_frames == 4 and film.size[0] == 1304
+        assert film.n_frames == 2 and film.size[0] == 1304
     left, right = picture[20, 300], picture[20, 652 + 300]
     assert left[0] > left[1] + 60.0 and right[1] > right[0] + 60.0  # vermilion, green
 
@@ -230,8 +229,8 @@ def test_a_short_row_of_a_film_ends_in_white(record: SceneRecord, tmp_path: Path
 
 def test_mp4_has_every_picture(record: SceneRecord, tmp_path: Path) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
-    assert write_film(top_view_film(record), tmp_path / "film.mp4", fps=10.0, speed=2.0) == 16
-    assert ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] == 16
+    assert write_film(top_view_film(record), tmp_path / "film.mp4", fps=10.0, speed=2.0) == 6
+    assert ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] == 6
 
 
 def test_other_formats_and_missing_extras_are_told(

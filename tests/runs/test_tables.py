@@ -26,7 +26,9 @@ SHORT = {"horizon": 1.0}
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
     out = tmp_path_factory.mktemp("runs") / "run"
-    return coopenv.run(FOUR_WAY, seed=2, observer="robust", overrides=SHORT, steady_from=0.5, out=out)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("coopenv.viz.figures.FIGURE_NAMES", ("topology",))
+        return coopenv.run(FOUR_WAY, seed=2, observer="robust", overrides=SHORT, steady_from=0.5, out=out)
 
 
 def test_a_run_in_python_is_that_of_the_shell(results: Results, tmp_path: Path, capsys: Any) -> None:

@@ -22,10 +22,12 @@ from coopenv.viz.figures import draw_figure
 from coopenv.viz.style import LEAST, contrast
 from coopenv.viz.topview import TopView
 from coopenv.viz.topview_ground import ASPHALT, GROUND, ROOF
+from tests.helpers.env_suite import rest_slow
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.synthetic import make_trajectory
 
 SLACK = 0.02  # inches, of the renderer's rounding
+WIDE = ("errors", "consistency")
 
 
 def shown_texts(figure: Figure) -> Iterator[Text]:
@@ -36,13 +38,13 @@ def shown_texts(figure: Figure) -> Iterator[Text]:
 
 
 @pytest.mark.parametrize(
-    ("name", "width"), [*product(FIGURE_NAMES, [None, "ieee1"]), ("errors", "springer2"), ("consistency", "springer2")]
+    ("name", "width"), [*product(FIGURE_NAMES, [None, "ieee1"]), *rest_slow(product(WIDE, ["springer2"]))]
 )
 def test_no_text_is_cut_and_all_of_it_stands_out(name: str, width: str | None) -> None:
     run = make_trajectory(ticks=601, noise=0.02)
     figure = draw_figure(name, run, scenario=coopenv.load_scenario(FOUR_WAY), width=width, gain=True)
     style.sign(figure, "crossing_path, robust, seed 0")
-    figure.canvas.draw()
+    figure.draw_without_rendering()
     drawn, size = figure.get_tightbbox(), figure.get_size_inches()  # of all that is drawn, inches
     assert drawn.x0 >= -SLACK and drawn.x1 <= size[0] + SLACK
     assert drawn.y0 >= -SLACK and drawn.y1 <= size[1] + SLACK
@@ -96,12 +98,16 @@ def test_an_unknown_column_or_figure_is_an_error_with_the_known_ones() -> None:
         draw_figure("error", make_trajectory(ticks=20))
 
 
+@pytest.fixture(scope="module")
+def alike() -> list[Figure]:
+    return [draw_figure("trajectories_2d", make_trajectory(ticks=60), width="ieee1") for _ in range(2)]
+
+
 @pytest.mark.parametrize("file_format", ["png", "pdf", "svg"])
-def test_files_have_metadata_and_are_the_same_each_time(file_format: str, tmp_path: Path) -> None:
+def test_files_have_metadata_and_are_the_same_each_time(file_format: str, alike: list[Figure], tmp_path: Path) -> None:
     about = {"environment": "overtaking", "observer": "robust", "seed": 3}
     path = tmp_path / f"f.{file_format}"
-    figures = (draw_figure("trajectories_2d", make_trajectory(ticks=60), width="ieee1") for _ in range(2))
-    content, again = (style.save(figure, path, about=about).read_bytes() for figure in figures)
+    content, again = (style.save(figure, path, about=about).read_bytes() for figure in alike)
     assert content == again
     text = content.decode("latin-1")
     assert "environment: overtaking; observer: robust; seed: 3" in text
