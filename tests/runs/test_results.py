@@ -193,6 +193,7 @@ def test_a_command_that_is_ended_leaves_the_earlier_result(
         raise Ended
 
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("coopenv.viz.figures.FIGURE_NAMES", ("topology",))
     assert main([*command, "1"]) == 0
     first = contents()
     with monkeypatch.context() as patched, pytest.raises(Ended):

@@ -260,7 +260,7 @@ LOW = 'overrides = { "camera.position" = [0.165, 0.0, 0.065] }\n'
     [
         ("", "swapped_signatures@0+6", "", "from motion capture"),
         ("", "swapped_signatures@0+6", BLIND, "its bearings"),
-        (LOW, "swapped_signatures@60", "", "m from motion capture"),
+        pytest.param(LOW, "swapped_signatures@60", "", "m from motion capture", marks=pytest.mark.slow),
         ("", "swapped_signatures@0+6", BLIND + "max_protection_level = 0.5\n", "if one source is faulty"),
         (RICCATI, "", BLIND + "max_protection_level = 0.5\n", "its estimate is inf m off at worst"),
     ],
