@@ -203,8 +203,8 @@ def first_episodes(
     return returned, length, infos["ended"]
 
 
-ALIKE = ("broken_camera", "busy_intersection_mirror", "busy_intersection_tracking", "city", "highway_intersection")
-ALIKE += ("large_crossing", "liar_among_us", "overtaking", "scout_platoon", "take_turns")
+ALIKE = ("busy_intersection_mirror", "busy_intersection_tracking", "city", "highway_intersection")
+ALIKE += ("large_crossing", "overtaking", "scout_platoon", "take_turns")
 """Environments whose files use what those of others use, too; the quick tests do without them."""
 
 LARGEST = ("large_crossing", "urban_crossing")
