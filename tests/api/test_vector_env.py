@@ -133,7 +133,7 @@ def test_dead_rows(autoreset: str) -> None:
     rng = np.random.default_rng(0)
     dead = np.zeros(env.num_envs, dtype=bool)
     deaths = ends = 0
-    for _ in range(600):
+    for _ in range(250):
         ticks = env.engine.view("tick").copy()
         _, reward, terminated, truncated, infos = env.step(np.abs(actions_for(env, rng)))
         assert np.array_equal(infos.get("final_info", infos)["alive"], ~dead)

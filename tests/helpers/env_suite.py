@@ -222,6 +222,6 @@ def each_slow(environments: Iterable[str], *slow: str) -> list[Any]:
     return [pytest.param(name, marks=pytest.mark.slow) if name in slow else name for name in environments]
 
 
-def largest_slow(environments: Iterable[str]) -> list[Any]:
-    """Return environments as parameters, the largest ones marked slow."""
-    return each_slow(environments, *LARGEST)
+def largest_slow(environments: Iterable[str], *more: str) -> list[Any]:
+    """Return environments as parameters, the largest ones and some more marked slow."""
+    return each_slow(environments, *LARGEST, *more)

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from coopenv.world.launch import start_warp
+from coopenv.world.launch import compiler_options, start_warp
 from coopenv.world.warp_internals import scalar_of
 
 DTYPES = ("float64", "float32")
@@ -34,7 +34,7 @@ class Calls:
         self, name: str, both: Mapping[wp.Function, str], wide: Mapping[wp.Function, str] | None = None
     ) -> None:
         self._module = wp.get_module(f"{name}.calls")
-        self._module.options["enable_backward"] = False
+        self._module.options |= {"enable_backward": False, **compiler_options()}
         self._kernels: dict[tuple[wp.Function, str], tuple[wp.Kernel, list[Any], list[Any]]] = {}
         for dtype, functions in (("float64", {**both, **(wide or {})}), ("float32", both)):
             for function, signature in functions.items():

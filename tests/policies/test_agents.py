@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +23,7 @@ from coopenv.policies.route_follower import RouteFollower
 from coopenv.policies.scripted import Peek
 from coopenv.policies.single_vehicle import SingleVehicleEnv
 from coopenv.runs.rollouts import rollout
+from tests.helpers.env_suite import SHIPPED
 from tests.helpers.four_way import FOUR_WAY
 
 PAIRS = [(agent, env) for agent in list_agents() for env in find_agent(agent).environments]
@@ -36,12 +38,17 @@ def test_agent_has_a_card_with_results(agent: str, name: str) -> None:
     assert f"| {name} |" in (folder / "card.md").read_text(encoding="utf-8")
 
 
+@cache
+def batch_of(name: str) -> coopenv.CooperativeVectorEnv:
+    """Return two worlds of an environment, the same for all its agents."""
+    return coopenv.make_vec(name, num_worlds=2)
+
+
 @pytest.mark.parametrize(("agent", "name"), PAIRS)
 def test_agent_drives(agent: str, name: str) -> None:
     """Actions are within the space, the same for the same seed, and each row's its own affair: a planner's, which
     predicts with each vehicle's camera, each world's."""
-    scenario = coopenv.load_scenario(name)
-    envs = coopenv.make_vec(name, num_worlds=2)
+    scenario, envs = SHIPPED[name], batch_of(name)
     policy, again, alone = (load_agent(agent, scenario) for _ in range(3))
     by_vehicle = "look_ahead" in agent or agent == "general"
     rows, some = np.arange(envs.num_envs), len(scenario.vehicles) if by_vehicle else 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -194,13 +195,14 @@ def test_flags_of_the_user_stay(monkeypatch: pytest.MonkeyPatch, flags: str | No
 
 PRIVATE = {"_cls", "_wp_scalar_type_", "native_func", "hooks", "adj", "runtime"}
 PACKAGE = Path(coopenv.__file__).parent
+NAMED = re.compile(rf"\b({'|'.join(PRIVATE)}|_src|__class__|warp\._)")
 OWN = PACKAGE / "world" / "warp_internals.py"
 
 
 def private_uses(path: Path) -> list[int]:
     """Return the lines of a file in which private names of Warp stand, as attributes, texts or imports."""
-    uses = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    uses, text = [], path.read_text(encoding="utf-8")
+    for node in ast.walk(ast.parse(text)) if NAMED.search(text) else ():
         if (
             (isinstance(node, ast.Attribute) and (node.attr in PRIVATE or (node.attr == "_src")))
             or (isinstance(node, ast.Attribute) and node.attr == "__class__" and isinstance(node.ctx, ast.Store))

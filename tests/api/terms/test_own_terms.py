@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import runpy
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -197,7 +195,7 @@ def test_terms_in_a_file_beside_the_scenario(tmp_path: Path) -> None:
         assert first[1] == pytest.approx(-gain * first[4]["position_error"], rel=1e-5)
 
 
-def test_a_program_needs_one_file_for_a_reward_of_its_own(tmp_path: Path) -> None:
+def test_a_program_needs_one_file_for_a_reward_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     program = tmp_path / "program.py"
     program.write_text(
         "import json, numpy as np, coopenv\n"
@@ -209,9 +207,8 @@ def test_a_program_needs_one_file_for_a_reward_of_its_own(tmp_path: Path) -> Non
         "print(json.dumps(env.step(np.zeros((1, 2)))[1].tolist()))\n",
         encoding="utf-8",
     )
-    result = subprocess.run([sys.executable, str(program)], capture_output=True, text=True, cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
-    assert json.loads(result.stdout) == [pytest.approx(-0.1)]
+    runpy.run_path(str(program), run_name="__main__")
+    assert json.loads(capsys.readouterr().out) == [pytest.approx(-0.1)]
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from coopenv.estimation.poses import Coordinates
 from coopenv.observers.contract import Gains, Message, Received, SensorNoise, Setup, Tick
 from coopenv.observers.planar import PlanarEkf, PlanarRobust
 from coopenv.observers.runner import run
+from tests.helpers.env_suite import rest_slow
 from tests.helpers.mrclam_files import barrier_robots, carried_off
 from tests.helpers.recordings import Tampering, completed
 
@@ -142,7 +143,7 @@ def test_robots_in_space_are_refused():
         PlanarRobust(replace(setup(0), planar=False))
 
 
-@pytest.mark.parametrize("turn_scale", [0.6, pytest.param(1.0, marks=pytest.mark.slow), 1.5])
+@pytest.mark.parametrize("turn_scale", rest_slow([0.6, 1.0, 1.5], 0))
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_odometry_that_lies_about_turns(seed, turn_scale):
     """The covariance stays honest and nobody is lost, whatever the wheels make of a command."""
@@ -176,18 +177,18 @@ class Watched(PlanarRobust):
         return message
 
 
-@pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 5))])
-def test_a_robot_that_is_carried_off_notices_and_finds_itself(seed):
+@pytest.mark.parametrize(("seed", "at"), rest_slow([(3, 15.0), (1, 50.0), (5, 50.0)], 0))
+def test_a_robot_that_is_carried_off_notices_and_finds_itself(seed, at):
     Watched.all = []
-    record = carried_off(seed, robot=2, at=50.0, seconds=120.0)
+    record = carried_off(seed, robot=2, at=at, seconds=at + 70.0)
     result = run(Watched, record)
     lost = np.array(Watched.all[2].lost_at)
-    assert lost.size and 50.0 <= lost[0] < 75.0 and lost[-1] < 105.0
+    assert lost.size and at <= lost[0] < at + 25.0 and lost[-1] < at + 55.0
     assert all(message.position is None and message.size_bytes == 0 for message in Watched.all[2].sent)
     at = np.isin(np.round(result.t, 6), np.round(lost, 6))
     std = np.sqrt(np.diagonal(result.covariance[at, 2], axis1=1, axis2=2))
     assert (std[:, 2] > 1.0).all() and (std[:, 3:5] > 3.0).all()  # it says that it does not know
-    end = result.t > 112.0
+    end = result.t > at + 62.0
     assert np.sqrt(np.mean(result.position_error[end, 2] ** 2)) < 0.4
     assert not any(Watched.all[n].lost_at for n in (0, 1, 3, 4))
 
@@ -241,7 +242,7 @@ def hostile() -> tuple[Message, ...]:
 
 
 def test_what_is_no_message_ends_no_run_and_changes_nothing():
-    record = recording_of(barrier_robots(1, 12.0), "landmarks+robots")
+    record = recording_of(barrier_robots(1, 8.0), "landmarks+robots")
     babbling, silent = (
         completed(PlanarRobust, record, Tampering(*[lambda _, m=m: m for m in sent], vehicle=0))
         for sent in (hostile(), [Message()])

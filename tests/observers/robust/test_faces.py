@@ -22,7 +22,7 @@ from coopenv.observers.robust.constants import MAX_MEMBERS, MEAN_TIME
 from coopenv.observers.runner import start_covariances
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
-from tests.helpers.env_suite import SHIPPED, rest_slow
+from tests.helpers.env_suite import SHIPPED, largest_slow, rest_slow
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import completed, replayed
 from tests.helpers.robust_ticks import OpenRobust
@@ -76,7 +76,7 @@ def test_a_search_ends_for_leaders_first() -> None:
 EMBEDDING = [name for name, scenario in SHIPPED.items() if scenario.observer.name == "robust"]
 
 
-@pytest.mark.parametrize("name", EMBEDDING)
+@pytest.mark.parametrize("name", largest_slow(EMBEDDING, "highway_intersection"))
 def test_the_first_seconds_are_off_by_what_their_covariances_say(name: str) -> None:
     """Of errors that are no Gaussian the mean NEES is exact at the start, too: 3 of a turn and 3 of a place.
 

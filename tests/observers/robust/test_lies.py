@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.observers import Message, run
+from coopenv.observers import Message, Recording, run
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.builders import reset, simulate
@@ -75,7 +75,7 @@ MOST = {
 @pytest.mark.parametrize(
     ("seeds", "seconds"), [(range(6), 25), pytest.param(range(900, 924), 45, marks=pytest.mark.slow)], ids=str
 )
-@pytest.mark.parametrize("name", LIES)
+@pytest.mark.parametrize("name", rest_slow(LIES, 0, 2, 3, 4, 5, 6, 8, 9, 10))  # not two of one kind
 def test_a_lie_costs_little(name: str, seeds: range, seconds: int) -> None:
     """In most worlds."""
     ratio, means = costs(name, seeds, seconds)
@@ -174,7 +174,7 @@ class Alters:
         return replace(message, position=fields.pop("position"), covariance=fields.pop("covariance"), extra=fields)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", rest_slow(range(3), 0, 1))
 def test_messages_with_altered_entries_end_no_run(seed: int) -> None:
     made = load_scenario("busy_intersection_tracking", {"horizon": 6.0})
     found = completed("robust", record(made, seed), Alters(np.random.default_rng(seed)))
@@ -182,9 +182,15 @@ def test_messages_with_altered_entries_end_no_run(seed: int) -> None:
     assert found.position_error[-60:, 0].max() < 0.2  # who hears nobody is not touched
 
 
+@cache
+def honest_recording(horizon: float, seed: int) -> Recording:
+    """Return a recording of the scene without a lie."""
+    return record(scene(horizon=horizon), seed)
+
+
 def errors_beside(sender: int, start: float, seed: int, horizon: float, altered: bool) -> np.ndarray:
     """Return (K, N-1) errors of the others in m, from `start` (at least 5 s) on, of honest or altered messages."""
-    recording = record(scene(horizon=horizon), seed)
+    recording = honest_recording(horizon, seed)
     found = completed("robust", recording, Alters(np.random.default_rng(seed), sender, start) if altered else None)
     return found.position_error[recording.t > max(start, 5.0)][:, [n for n in range(5) if n != sender]]
 
@@ -192,7 +198,7 @@ def errors_beside(sender: int, start: float, seed: int, horizon: float, altered:
 @pytest.mark.parametrize("sender", rest_slow([1, 3], 0))
 def test_altered_messages_of_one_sender_lead_nobody_astray(sender: int) -> None:
     """Whether they count or not; others see two honest targets besides."""
-    assert errors_beside(sender, 12.0, 2, 24.0, True).max() < 0.8
+    assert errors_beside(sender, 6.0, 2, 14.0, True).max() < 0.8
 
 
 @dataclass
@@ -215,7 +221,7 @@ class OneAltered:
 
 @pytest.mark.parametrize("what", ["covariance", "odometry"])
 def test_a_single_absurd_message_makes_nobody_uncertain(what: str) -> None:
-    recording = record(scene(horizon=9.0), 907)
+    recording = honest_recording(9.0, 907)
     found = run("robust", recording, OneAltered(what))
     others = found.covariance[recording.t > 4.0][:, [0, 1, 3, 4]]
     assert np.sqrt(np.trace(others[..., 3:, 3:], axis1=-2, axis2=-1)).max() < 0.4

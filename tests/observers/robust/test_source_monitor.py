@@ -60,7 +60,7 @@ def cost(watched: Watched, without: Watched, start: float) -> np.ndarray:
             (fast, 0, 2, (2.0, 3.0, 4.0, 6.0)),
             (fast, 0, NO_TARGET, (2.0, 3.0, 4.0, 6.0)),
             (seen, 0, 1, (1.0, 3.0, 8.0)),
-            (seen, 0, NO_TARGET, (1.0, 3.0, 8.0)),
+            (seen, 0, NO_TARGET, (1.0, 3.0)),
             (seen, 1, FIRST, (1.0, 3.0, 8.0)),
             (busy, 1, FIRST, (1.0, 3.0, 8.0)),
         ],
@@ -73,9 +73,10 @@ def test_a_sensitivity_is_the_derivative_of_the_estimate(
     make: Callable[..., Recording], vehicle: int, target: int, times: tuple[float, ...]
 ) -> None:
     """By the differences of runs with small faults: of a landmark, a sender that is a leader, and the odometry."""
-    recording, size = make(8.2, 1), 1e-3
+    horizon, size = times[-1] + 0.2, 1e-3
+    recording = make(horizon, 1)
     ticks = np.rint(np.divide(times, recording.dt)).astype(int)
-    without = usual(make, 8.2, 1)
+    without = usual(make, horizon, 1)
     expected = np.empty((len(ticks), 6, 3))
     for axis, fault in enumerate(size * np.eye(3)):
         if target == NO_TARGET:
@@ -158,9 +159,9 @@ def test_errors_of_senders_are_eliminated(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_the_solution_without_a_landmark_follows_from_that_with_it(seed: int) -> None:
     """x + Phi f against a run in which the landmark is not seen, in deviations; x alone is elsewhere."""
-    with_it, k, off = usual(seen, 8.2, seed), 60, []
+    with_it, k, off = usual(seen, 3.2, seed), 60, []
     for landmark in range(3):
-        without = watch(faults.hidden_landmark(seen(8.2, seed), landmark))
+        without = watch(faults.hidden_landmark(seen(3.2, seed), landmark))
         Phi = with_it.of("sensitivity", 0, landmark)[k]
         moved = displaced(with_it.pose(k, 0), Phi @ with_it.of("offset", 0, landmark)[k])
         P = with_it.run.covariance[k, 0] + Phi @ with_it.of("covariance", 0, landmark)[k] @ Phi.T
@@ -183,7 +184,7 @@ def test_a_landmark_that_is_wrong_from_the_start_is_rejected_whichever_comes_fir
     assert np.median(engine.view("position_error")[:, 0]) < 1.0  # 2.4 to 4.5 m with each bearing gated alone
 
 
-@pytest.mark.parametrize(("landmark", "size"), [(4, 0.1), (5, 0.1), (6, 0.3), (8, 0.3)])
+@pytest.mark.parametrize(("landmark", "size"), rest_slow([(4, 0.1), (5, 0.1), (6, 0.3), (8, 0.3)], 0, 2))
 def test_a_landmark_s_fault_is_estimated(landmark: int, size: float) -> None:
     """At the exclusion, or when it is last seen, with the covariance that is stated: a chi-square of 3 or so."""
     rng, squares, right = np.random.default_rng(landmark), [], []
@@ -206,7 +207,8 @@ def test_a_landmark_s_fault_is_estimated(landmark: int, size: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "of", "most"), [(busy, (24.0, 0), 3.0), (busy, (24.0, 1), 3.0), (fast, (16.0, 0), 3.0), (lane, (), 4.0)]
+    ("make", "of", "most"),
+    rest_slow([(busy, (24.0, 0), 3.0), (busy, (24.0, 1), 3.0), (fast, (16.0, 0), 3.0), (lane, (), 4.0)], 0, 2, 3),
 )
 def test_who_is_honest_is_believed(make: Callable[..., Recording], of: tuple[float, ...], most: float) -> None:
     """Ratios are of a size of a chi-square of 3, whose median is 2.4, or below: nobody comes near the gate."""
@@ -252,7 +254,7 @@ def test_a_scale_that_keeps_changing_becomes_a_scale_that_walks() -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "vehicle", "angle"), [(busy, 1, 3.0), (busy, 3, -5.0), (fast, 0, 2.0), (fast, 2, -8.0)]
+    ("make", "vehicle", "angle"), rest_slow([(busy, 1, 3.0), (busy, 3, -5.0), (fast, 0, 2.0), (fast, 2, -8.0)], 0, 3)
 )
 def test_a_turn_of_a_camera_costs_nothing(make: Callable[..., Recording], vehicle: int, angle: float) -> None:
     """Own sensors alone are corrected, within 2.5 s, and all others stay as they were."""
@@ -270,7 +272,7 @@ def test_a_turn_of_a_camera_costs_nothing(make: Callable[..., Recording], vehicl
 def test_a_landmark_that_is_right_again_is_readmitted() -> None:
     """It is off by 1 m from 3 s on: until 9 s, and for good."""
     landmark, followers = 2, (0, 2, 3, 4)
-    recording = seen(20.0, 0)
+    recording = seen(16.0, 0)
     passing = watch(wrong_landmark(recording, landmark, METRE, 3.0, 9.0))
     lasting = watch(wrong_landmark(recording, landmark, METRE, 3.0))
     for found in (passing, lasting):
@@ -279,10 +281,10 @@ def test_a_landmark_that_is_right_again_is_readmitted() -> None:
         excluded, readmitted = passing.changes(vehicle, landmark)
         assert 3.0 < excluded < 9.0 < readmitted < 14.0
         assert len(lasting.changes(vehicle, landmark)) == 1
-    assert (cost(passing, usual(seen, 20.0, 0), 14.0) < 2.0).all()
+    assert (cost(passing, usual(seen, 16.0, 0), 14.0) < 2.0).all()
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", rest_slow(range(2), 0))
 def test_a_sender_that_is_right_again_is_readmitted(seed: int) -> None:
     """It says that it is elsewhere by 1 m from 5 to 12 s, or from 10 s on."""
     liar = FIRST + 1
@@ -308,7 +310,7 @@ def test_a_gyro_s_bias_that_is_not_declared_costs_little() -> None:
 
 def test_a_wrong_landmark_on_a_fast_road_costs_little() -> None:
     """Off by 3 m, and passed at 25 m/s."""
-    found = [watch(wrong_landmark(fast(16.0, seed), 7, 3.0 * METRE)) for seed in range(4)]
+    found = [watch(wrong_landmark(fast(16.0, seed), 7, 3.0 * METRE)) for seed in range(2)]
     assert all(one.excluded() == {(0, 7), (1, 7), (2, 7)} for one in found)
     ratios = [cost(one, usual(fast, 16.0, seed), 4.0) for seed, one in enumerate(found)]
     assert np.mean(ratios) < 1.5, np.round(ratios, 2)
