@@ -31,7 +31,7 @@ PAGES = Path(__file__).parents[2] / "docs" / "environments"
 SMALL = """
 title = "A | b"
 description = "One <car>."
-horizon = 5.0
+horizon = 2.0
 landmarks = [{ name = "sign", position = [1, 2, 3], presence = 0.75 }]
 landmark_groups = [{ name = "posts", count = 3, boxes = [{ center = [5, 5], half = [2, 1] }], height = [0.4, 1.2] }]
 vehicles = [{ initial_pose = { position = [0, 0, 0], yaw_spread = 0.1 }, motion = { kind = "driven" } }]
@@ -96,7 +96,7 @@ def test_a_page_says_what_the_file_says(small: Path, tmp_path: Path, capsys: pyt
         *("# A | b", "One &lt;car>.", "- whether a landmark is there: with 75 %", "| `time` | 0.375 | s |"),
         *("- the places of 3 landmarks `posts`, over one area", "- a factor of the cameras' range: 0.75 to 1.25"),
         *("0 at difficulty 0, 2 at 1", "| posts | 3 | (5, 5) +- (2, 1) | 0.4 to 1.2 |", "| `camera.range` | 7.25 |"),
-        *("- a vehicle's heading: +- 5.73 deg", "| steering | -0.6981 | 0.6981 | rad |", "after 5 s, 50 decisions"),
+        *("- a vehicle's heading: +- 5.73 deg", "| steering | -0.6981 | 0.6981 | rad |", "after 2 s, 20 decisions"),
     ):
         assert line in text, line
     assert "| posts_1 |" not in text

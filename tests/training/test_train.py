@@ -8,6 +8,8 @@ import os
 import shlex
 import signal
 import sys
+from contextlib import chdir, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from subprocess import Popen
 
@@ -99,10 +101,9 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the agent of a training that nothing interrupted."""
     folder = tmp_path_factory.mktemp("reference")
     (folder / "train.toml").write_text(SETTINGS)
-    process = start((*COOPENV, *fresh("--json")), folder)
-    printed, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
-    told = {row["metric"]: row for row in json.loads(printed)["results"]}
+    with chdir(folder), redirect_stdout(StringIO()) as printed:
+        assert main(fresh("--json")) == 0
+    told = {row["metric"]: row for row in json.loads(printed.getvalue())["results"]}
     assert told["e95_m"]["ci_low"] <= told["e95_m"]["mean"] <= told["e95_m"]["ci_high"]
     return folder / "agent"
 

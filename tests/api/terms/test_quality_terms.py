@@ -69,7 +69,7 @@ VALUES = ("position_std", "position_error", "log_determinant", "ended", "furthes
 def drive(place: str, name: str) -> Drive:
     scenario = scenario_of(place)
     changes = {**OVERRIDES, **PLACES[place]}
-    envs = coopenv.make_vec(place.partition(",")[0], num_worlds=6, autoreset="disabled", overrides=changes)
+    envs = coopenv.make_vec(place.partition(",")[0], num_worlds=3, autoreset="disabled", overrides=changes)
     engine, policy = envs.engine, driver(name, scenario)
     observations, _ = envs.reset(seed=3)
     steps: list[list[np.ndarray]] = [[engine.view(field).copy() for field in (*VALUES, "alive", "terms", "reward")]]

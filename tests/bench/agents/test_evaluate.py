@@ -19,7 +19,7 @@ from coopenv.cli import main
 from coopenv.evaluation import METRICS
 from tests.helpers.commands import refused
 
-SHORT = ["urban_crossing", "--worlds", "3", "--set", "horizon=2.0"]
+SHORT = ["urban_crossing", "--worlds", "3", "--set", "horizon=1.0"]
 OWN = """
 import numpy as np
 
@@ -55,7 +55,7 @@ def test_tables_and_files(capsys: pytest.CaptureFixture[str], monkeypatch: pytes
     assert [(row["agent"], row["kind"]) for row in found["rows"]] == [a for a in agents for _ in METRICS]
     assert {row["agent"] for row in found["differences"]} == {"still", "ideal_sensing"}
     assert found["reference"] == "route_follower"
-    assert found["overrides"] == {"horizon": 2.0}
+    assert found["overrides"] == {"horizon": 1.0}
     with Image.open("eval/video.gif") as film:
         assert film.n_frames > 10
     assert refused(*command).endswith("eval/evaluation.json: exists already; --force replaces it\n")

@@ -25,9 +25,10 @@ from coopenv.bench.observers.rows import Row
 from coopenv.bench.observers.tables import headline, quality
 from coopenv.cli import main
 from coopenv.observers import registry
-from tests.bench.observers.test_comparison import SOURCE, Raises
+from tests.bench.observers.test_comparison import SOURCE
 from tests.helpers import mrclam_files
 from tests.helpers.commands import refused
+from tests.helpers.odd_observers import Raises
 
 REQUIRED = {
     *("environment", "variant", "observer", "vehicle", "position_rmse_m", "orientation_rmse_deg", "bound_m", "anees"),
@@ -240,7 +241,7 @@ def test_what_cannot_be_compared_is_left_out_with_its_reason(
 ) -> None:
     """A variant that a single vehicle cannot have, and a package's observer that cannot be loaded."""
     monkeypatch.setattr(registry, "entry_points", lambda group: [EntryPoint("broken", "no_such_module:Thing", group)])
-    short = ["--set", "horizon=0.3", "--seeds", "1", "--jobs", "1"]
+    short = ["--set", "horizon=0.1", "--seeds", "1", "--jobs", "1"]
     assert main(["bench", "observers", "crossing_path", "--variants", "all", *short]) == 0
     told = capsys.readouterr()
     left_out = {line.split()[2]: line for line in told.err.splitlines() if line.startswith("left out: ")}

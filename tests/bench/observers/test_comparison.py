@@ -29,12 +29,12 @@ from coopenv.bench.observers.sources import variants_of
 from coopenv.bench.observers.tables import everything, failures
 from coopenv.cli.bench import ObserverOptions
 from coopenv.observers import registry, run
-from coopenv.observers.contract import Estimate, Tick
 from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.runs.recorder import record
 from coopenv.viz.figures import COLUMNS
 from tests.helpers import mrclam_files
 from tests.helpers.commands import printed
+from tests.helpers.odd_observers import Raises, Tells
 
 SHORT = {"horizon": 1.5}
 
@@ -68,21 +68,6 @@ def test_vehicles_without_any_truth_are_not_judged() -> None:
     assert board.totals["nominal", "mekf_covariance"].rmse.value == pytest.approx(expected.mean())
     text = printed(*everything(board))
     assert re.search(r"f1 +f3 +f4 +f5 +mean", text) and "Not judged, as no true poses are known: vehicle_2." in text
-
-
-class Raises(DeadReckoning):
-    """Fails at its first update."""
-
-    def update(self, tick: Tick) -> Estimate:
-        raise ZeroDivisionError("by design")
-
-
-class Tells(DeadReckoning):
-    """Tells an innovation of 3 in 2 degrees of freedom."""
-
-    def update(self, tick: Tick) -> Estimate:
-        found = super().update(tick)
-        return Estimate(found.rotation, found.position, found.covariance, found.coordinates, 3.0, 2)
 
 
 SOURCE = """

@@ -147,7 +147,7 @@ def test_normalised_innovations_have_a_mean_of_one():
 
 @pytest.fixture(scope="module")
 def nominal():
-    record = recording_of(barrier_robots(31, 40.0, 0.8), "landmarks+robots")
+    record = recording_of(barrier_robots(31, 30.0, 0.8), "landmarks+robots")
     return record, run(PlanarRobust, record)
 
 
