@@ -169,7 +169,8 @@ def test_record_video(vehicles: str, tmp_path: Path) -> None:
         short = coopenv.parallel_env(FOUR_WAY, render_mode="rgb_array", overrides={"horizon": 0.3})
         env = RecordVideoParallel(short, str(tmp_path))
     elif hasattr(wrappers, "RecordVideo"):
-        env = wrappers.RecordVideo(batch(render_mode="rgb_array"), str(tmp_path), video_length=3)
+        rows = coopenv.make_vec(FOUR_WAY, num_worlds=1, render_mode="rgb_array")
+        env = wrappers.RecordVideo(rows, str(tmp_path), video_length=3)
     else:
         pytest.skip("this Gymnasium records no batches")
     env.reset(seed=0)

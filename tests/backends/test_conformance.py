@@ -62,15 +62,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def lab(folder: Path) -> Iterator[tuple[Path, Any]]:
-    path = write_fleet(folder)
-    with fakes(path) as (hub, _):
-        yield path, hub
-
-
-@pytest.fixture(scope="module")
 def processes(folder: Path) -> Iterator[Path]:
-    """Start a router and two fake cars, each a process."""
+    """Start two fake cars, each a process, and their router in this one."""
     port = free_port()
     network = f'[network]\nconnect = ["tcp/127.0.0.1:{port}"]\n'
     path = folder / "zenoh.toml"
@@ -83,7 +76,7 @@ def processes(folder: Path) -> Iterator[Path]:
             stack.callback(process.kill)
             return process.stdout
 
-        assert "ready" in launch("router", "--listen", f"tcp/127.0.0.1:{port}").readline()
+        stack.callback(open_zenoh("router", listen=[f"tcp/127.0.0.1:{port}"]).close)
         both = [launch("fake", str(path), "--car", car) for car in ("svea7", "svea1")]  # which load at a time
         assert all("ready" in said.readline() for said in both)
         yield path
@@ -92,8 +85,7 @@ def processes(folder: Path) -> Iterator[Path]:
 @pytest.fixture(scope="module")
 def drive(folder: Path) -> Path:
     """Record a drive of three seconds, of which a busy computer takes part of the frames."""
-    path = write_fleet(folder)
-    with fakes(path) as (hub, _):  # which stand still again before anything is done with the drive
+    with fakes(path := write_fleet(folder)) as (hub, _):
         env = coopenv.parallel_env("cars", backend=cars(path, hub, overrides=OVERRIDES, record=folder / "drive.mcap"))
         env.reset(seed=5, options={"arm": True})
         for _ in range(60):
@@ -103,19 +95,21 @@ def drive(folder: Path) -> Path:
 
 
 @pytest.fixture(scope="module", params=["simulated", "drive", "bag", "in process", "over zenoh"])
-def make(request: pytest.FixtureRequest, folder: Path) -> Make:
+def make(request: pytest.FixtureRequest, folder: Path) -> Iterator[Make]:
+    """Yield what makes the environment; fake cars in this process drive for no longer than they are asked for."""
     if request.param == "simulated":
-        return simulated
-    if request.param == "in process":
-        return partial(in_process, *request.getfixturevalue("lab"))
-    if request.param == "over zenoh":
-        return partial(over_zenoh, request.getfixturevalue("processes"))
-    path = request.getfixturevalue("drive")
-    if request.param == "drive":
-        return partial(recorded, path)
-    topics = folder / "topics.toml"
-    topics.write_text(TOPICS_OF_A_LAB.replace("INCLUDE", str(GROUPS).replace("'", '"')))
-    return partial(imported, path, topics)
+        yield simulated
+    elif request.param == "in process":
+        with fakes(path := write_fleet(folder)) as (hub, _):
+            yield partial(in_process, path, hub)
+    elif request.param == "over zenoh":
+        yield partial(over_zenoh, request.getfixturevalue("processes"))
+    elif request.param == "drive":
+        yield partial(recorded, request.getfixturevalue("drive"))
+    else:
+        topics = folder / "topics.toml"
+        topics.write_text(TOPICS_OF_A_LAB.replace("INCLUDE", str(GROUPS).replace("'", '"')))
+        yield partial(imported, request.getfixturevalue("drive"), topics)
 
 
 def assert_spaces_of_the_simulator(env: Env, observation: Any) -> None:
@@ -193,12 +187,11 @@ def driving(commands: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
     return {n: command for n, command in commands.items() if n >= first}
 
 
-def test_actions_mean_the_same_speeds_and_angles(lab: tuple[Path, Any], processes: Path) -> None:
+def test_actions_mean_the_same_speeds_and_angles(folder: Path, processes: Path) -> None:
     """What goes out to the gates is what the simulated vehicles follow, whatever network it takes.
 
     Commands are not sent again where a network loses one, so that actions go on until enough have been heard.
     """
-    path, hub = lab
     actions = np.random.default_rng(3).uniform(-1.0, 1.0, (40, 2)).astype(np.float32)  # none repeats
     expected = simulated()
     expected.reset(seed=1)
@@ -208,8 +201,8 @@ def test_actions_mean_the_same_speeds_and_angles(lab: tuple[Path, Any], processe
         told.append(expected.engine.view("command")[0, :, :2].copy())
     assert len({tuple(np.round(command[0], 6)) for command in told}) > 4
     wanted = dict(zip(("svea7", "svea1"), np.swapaxes(told, 0, 1), strict=True))
-    watch = open_zenoh("client", [line.split('"')[1] for line in processes.read_text().splitlines() if "tcp/" in line])
-    for network, env in ((hub.connect(), in_process(path, hub)), (watch, over_zenoh(processes))):
+
+    def check(network: Any, env: Env) -> None:
         arrivals: list[Arrival] = []
         for car in wanted:
             network.subscribe(SVEA.topic_of(car, Role.COMMAND), arrivals.append)
@@ -231,6 +224,11 @@ def test_actions_mean_the_same_speeds_and_angles(lab: tuple[Path, Any], processe
         for car, commands in heard.items():
             assert len(driving(commands)) >= 6, (car, commands)
             assert len(begins_at(driving(commands), wanted[car])) == 1, (car, commands)
+
+    endpoints = [line.split('"')[1] for line in processes.read_text().splitlines() if "tcp/" in line]
+    check(open_zenoh("client", endpoints), over_zenoh(processes))
+    with fakes(path := write_fleet(folder)) as (hub, _):
+        check(hub.connect(), in_process(path, hub))
 
 
 @pytest.mark.parametrize("options", [{"nonsense": 1}])

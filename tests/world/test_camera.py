@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import Sight
 from coopenv.world import camera
+from coopenv.world.launch import compiler_options
 from coopenv.world.model import entry_struct, precision
 from tests.helpers.builders import landmark, quaternion_wxyz, run, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES, Calls
@@ -165,7 +166,7 @@ def test_quantised_and_distorted() -> None:
     assert np.abs(uv - geometry.project(point[visible], **PIXY, distortion=PLUMB_BOB)).max() < 0.501
 
 
-@wp.kernel(enable_backward=False, module="unique")
+@wp.kernel(enable_backward=False, module="unique", module_options=compiler_options())
 def there_and_back(lens: Any, xy: wp.array(dtype=Any), out: wp.array(dtype=Any), back: wp.array(dtype=Any)):
     i = wp.tid()
     x, y = camera.distort(lens, xy[i][0], xy[i][1])

@@ -16,7 +16,7 @@ from coopenv import ScenarioError
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.estimation import Outcome, Sight
 from coopenv.scenario import Scenario
-from coopenv.world.launch import start_warp
+from coopenv.world.launch import compiler_options, start_warp
 from coopenv.world.model import precision
 from coopenv.world.route import place_on_route, point_on_route
 from coopenv.world.state import allocate, state_struct
@@ -25,6 +25,7 @@ from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.warp_calls import DTYPES
 
 start_warp()
+wp.set_module_options(compiler_options())
 
 
 @wp.kernel(enable_backward=False)

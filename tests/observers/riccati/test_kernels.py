@@ -35,6 +35,7 @@ from tests.oracles.batch import small_errors
 
 LEVER = (0.3, -0.1, 0.2)
 ESTIMATE = ("estimate_rotation", "estimate_position", "covariance")
+POSES = ("rotation", "position", *ESTIMATE[:2])
 
 
 OFF = {"position_offset": [0.4, -0.3, 0.2], "orientation_offset_wxyz": [0.98, 0.0, 0.0, 0.198997487]}
@@ -84,7 +85,7 @@ def test_error_against_the_continuous_observer_falls_with_the_step(k: float, q: 
     reference = continuous.solve(described, 2.0, method="LSODA", sample=0.5)
     found = []
     for rate in (30, 120, 480):
-        states = run(start(from_oracle(described, rate)), 2 * rate)[:: rate // 2]
+        states = run(start(from_oracle(described, rate)), 2 * rate, *ESTIMATE)[:: rate // 2]
         truth = [described.pose(t)[1] for t in reference.t]
         position = [p - estimated_position(s)[0] for p, s in zip(truth, states, strict=True)]
         attitude = [s["estimate_rotation"][0] for s in states]
@@ -110,7 +111,7 @@ def test_busy_intersection_settles_like_the_continuous_observer() -> None:
     overrides = {"noise.enabled": False, "rates.camera": rate}
     world = start(load_scenario("busy_intersection", overrides))
     ticks = round(50.0 * rate)
-    states = run(world, ticks)
+    states = run(world, ticks, *POSES)
     position, angle = (np.array(x)[:, 0] for x in zip(*(errors(world, s) for s in states), strict=True))
     settled = continuous.settle_times(np.arange(ticks + 1) / rate, np.eye(3)[0] * position[..., None], angle)
     solved = continuous.solve(continuous.busy_intersection(), 50.0)
