@@ -229,8 +229,8 @@ def matrices(run: Trajectory, vehicle: int, t: float) -> tuple[np.ndarray, np.nd
     return A, M
 
 
-def solved(run: Trajectory, vehicle: int, until: float, k: float) -> tuple[np.ndarray, np.ndarray]:
-    """Integrate P and the transition X of the linearised error x' = (A - k P M) x up to a time."""
+def solved(run: Trajectory, vehicle: int, times: tuple[float, float], k: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return P and the transition X of the linearised error x' = (A - k P M) x at some times."""
 
     def flow(t: float, y: np.ndarray) -> np.ndarray:
         P, X = y[:36].reshape(6, 6), y[36:].reshape(6, 6)
@@ -239,17 +239,18 @@ def solved(run: Trajectory, vehicle: int, until: float, k: float) -> tuple[np.nd
         return np.concatenate([growth.ravel(), ((A - k * P @ M) @ X).ravel()])
 
     start = np.concatenate([np.diag(np.repeat(P0, 3)).ravel(), np.eye(6).ravel()])
-    end = solve_ivp(flow, (0.0, until), start, method="LSODA", rtol=1e-6, atol=1e-9, max_step=run.t[1]).y[:, -1]
-    return end[:36].reshape(6, 6), end[36:].reshape(6, 6)
+    step = run.t[1]
+    found = solve_ivp(flow, (0.0, times[-1]), start, "LSODA", times, rtol=1e-6, atol=1e-9, max_step=step).y.T
+    return [(end[:36].reshape(6, 6), end[36:].reshape(6, 6)) for end in found]
 
 
 @pytest.mark.parametrize(("vehicle", "k"), rest_slow([(0, 1.0), (3, 0.8)], 1))
 def test_rates_are_those_of_the_differential_equations(vehicle: int, k: float) -> None:
     run = make_trajectory(ticks=121, yaw_rate=YAW_RATE)
     rates = convergence_rates(run, [k] * 5, Q, V, P0)
-    for until in (1.0, 2.0):
+    times = (1.0, 2.0)
+    for until, (P, _) in zip(times, solved(run, vehicle, times, k), strict=True):
         n = round(until / run.t[1])
-        P, _ = solved(run, vehicle, until, k)
         _, M = matrices(run, vehicle, until)
         assert_allclose(rates.frozen[n, vehicle], k * eigvals(P @ M).real.min(), rtol=0.02)
         inverse = np.linalg.inv(P)
@@ -262,7 +263,7 @@ def test_no_error_falls_more_slowly_than_guaranteed(vehicle: int, k: float) -> N
     """In the norm of P^-1, from every direction: the worst ratio of norms is the largest singular value."""
     run = make_trajectory(ticks=121, yaw_rate=YAW_RATE)
     rates = convergence_rates(run, [k] * 5, Q, V, P0)
-    (P_early, X_early), (P_late, X_late) = (solved(run, vehicle, until, k) for until in (0.5, 2.0))
+    (P_early, X_early), (P_late, X_late) = solved(run, vehicle, (0.5, 2.0), k)
     between = X_late @ np.linalg.inv(X_early)
     shrunk = np.linalg.solve(np.linalg.cholesky(P_late), between @ np.linalg.cholesky(P_early))
     worst = np.linalg.svd(shrunk, compute_uv=False)[0]

@@ -30,7 +30,7 @@ SETTINGS = Settings(
     network="sets",
     steps=0,
     ppo=Ppo(hidden=(32, 32)),
-    clone=Clone(agent="look_ahead", episodes=2, epochs=2, elsewhere=EVERYWHERE),
+    clone=Clone(agent="look_ahead", episodes=1, epochs=2, elsewhere=EVERYWHERE),
     evaluation=EvaluationSettings(final_worlds=2),
 )
 PLAN = TrainingPlan("facade", SETTINGS, 0)
