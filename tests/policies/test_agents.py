@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,7 +23,7 @@ from coopenv.policies.route_follower import RouteFollower
 from coopenv.policies.scripted import Peek
 from coopenv.policies.single_vehicle import SingleVehicleEnv
 from coopenv.runs.rollouts import rollout
-from tests.helpers.env_suite import SHIPPED
+from tests.helpers.env_suite import SHIPPED, rest_slow
 from tests.helpers.four_way import FOUR_WAY
 
 PAIRS = [(agent, env) for agent in list_agents() for env in find_agent(agent).environments]
@@ -38,21 +38,11 @@ def test_agent_has_a_card_with_results(agent: str, name: str) -> None:
     assert f"| {name} |" in (folder / "card.md").read_text(encoding="utf-8")
 
 
-@cache
-def batch_of(name: str) -> coopenv.CooperativeVectorEnv:
-    """Return two worlds of an environment, the same for all its agents."""
-    return coopenv.make_vec(name, num_worlds=2)
+batch_of = cache(partial(coopenv.make_vec, num_worlds=2))  # one for all agents of an environment
+QUICK = [n for n, pair in enumerate(PAIRS) if pair[1] != "highway_intersection" or pair[0] == "constant_speed"]
 
 
-@pytest.mark.parametrize(
-    ("agent", "name"),
-    [  # cars of highway_intersection take longest, whoever drives them
-        pytest.param(agent, name, marks=pytest.mark.slow)
-        if name == "highway_intersection" and agent != "constant_speed"
-        else (agent, name)
-        for agent, name in PAIRS
-    ],
-)
+@pytest.mark.parametrize(("agent", "name"), rest_slow(PAIRS, *QUICK))
 def test_agent_drives(agent: str, name: str) -> None:
     """Actions are within the space, the same for the same seed, and each row's its own affair: a planner's, which
     predicts with each vehicle's camera, each world's."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.observers import Message, Recording, run
+from coopenv.observers import Message, run
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.builders import reset, simulate
@@ -182,10 +182,7 @@ def test_messages_with_altered_entries_end_no_run(seed: int) -> None:
     assert found.position_error[-60:, 0].max() < 0.2  # who hears nobody is not touched
 
 
-@cache
-def honest_recording(horizon: float, seed: int) -> Recording:
-    """Return a recording of the scene without a lie."""
-    return record(scene(horizon=horizon), seed)
+honest_recording = cache(lambda horizon, seed: record(scene(horizon=horizon), seed))
 
 
 def errors_beside(sender: int, start: float, seed: int, horizon: float, altered: bool) -> np.ndarray:

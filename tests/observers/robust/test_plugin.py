@@ -49,9 +49,9 @@ def test_landmarks_that_are_lost_do_not_mislead():
 
 def test_wrong_associations_mislead_in_the_first_frames_only():
     """Uncertain by 1 m and 10 degrees, a follower cannot tell two vehicles apart, and one swap of theirs passes."""
-    wrong = [VARIANTS["wrong_association"].applied(small_errors(12.0, seed), seed) for seed in range(3)]
+    wrong = [VARIANTS["wrong_association"].applied(small_errors(10.0, seed), seed) for seed in range(3)]
     assert sum(misled(record) for record in wrong) <= 1
-    right = small_errors(12.0)
+    right = small_errors(10.0)
     first = (right.t < 0.1)[:, None, None, None]
     assert not misled(replace(right, bearings=np.where(first, right.bearings, wrong[0].bearings)))
 

@@ -301,10 +301,8 @@ def test_a_sender_that_is_right_again_is_readmitted(seed: int) -> None:
 
 def test_a_gyro_s_bias_that_is_not_declared_costs_little() -> None:
     """Of 1 deg/s from 12 s on."""
-    step, ratios = CHANGES["gyro bias steps to 1 deg/s at 12 s"], []
-    for seed in range(2):
-        without = usual(busy, 24.0, seed)
-        ratios.append(cost(watch(changed(without.recording, step, seed)), without, STEP_AT))
+    step, without = CHANGES["gyro bias steps to 1 deg/s at 12 s"], usual(busy, 24.0, 0)
+    ratios = cost(watch(changed(without.recording, step, 0)), without, STEP_AT)
     assert np.mean(ratios) < 1.5, np.round(ratios, 2)
 
 
@@ -319,8 +317,8 @@ def test_a_wrong_landmark_on_a_fast_road_costs_little() -> None:
 @pytest.mark.parametrize("make", [busy, fast])
 def test_random_bearings_cost_little(make: Callable[..., Recording]) -> None:
     """Of ten bearings one points anywhere; no source has them all."""
-    ratios, horizon = [], 24.0 if make is busy else 16.0  # as above
-    for seed in range(2):
+    ratios, (horizon, seeds) = [], (24.0, 1) if make is busy else (16.0, 2)  # as above
+    for seed in range(seeds):
         without = usual(make, horizon, seed)
         found = watch(changed(without.recording, CHANGES["10 % of the bearings random"], seed))
         assert not found.excluded()
