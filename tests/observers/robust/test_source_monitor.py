@@ -63,6 +63,7 @@ def cost(watched: Watched, without: Watched, start: float) -> np.ndarray:
             (seen, 0, NO_TARGET, (1.0, 3.0)),
             (seen, 1, FIRST, (1.0, 3.0, 8.0)),
             (busy, 1, FIRST, (1.0, 3.0, 8.0)),
+            (seen, 0, NO_TARGET, (1.0, 3.0, 8.0)),
         ],
         0,
         3,
