@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from coopenv.observers.contract import Estimate, Tick
-from coopenv.observers.single_frame import DeadReckoning
+from coopenv.observers.pose_filters import DeadReckoning
 
 
 class Raises(DeadReckoning):

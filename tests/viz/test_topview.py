@@ -259,7 +259,7 @@ def test_show_without_a_display_is_silent() -> None:
     """With each setting of Matplotlib's backend, in forks of one interpreter in which Matplotlib is not loaded yet."""
     script = (
         "import os, sys\n"
-        "import coopenv.scenario.files, coopenv.estimation.outcomes, coopenv.viz.scene\n"
+        "import coopenv.scenario.files, coopenv.estimation, coopenv.viz.scene\n"
         "assert 'matplotlib' not in sys.modules\n"
         "for backend in (None, 'tkagg', 'module://no_such_backend'):\n"
         "    if os.fork() == 0: break\n"
