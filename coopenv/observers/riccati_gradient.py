@@ -137,7 +137,9 @@ def see_kernel(model: Any, state: Any):
 
 def inform_kernel(
     model: Any,
-    state: Any,
+    sight: wp.array3d(dtype=wp.uint8),
+    position: wp.array2d(dtype=Any),
+    rotation: wp.array2d(dtype=Any),
     truth: Any,
     predicted: Any,
     corrected: Any,
@@ -148,7 +150,7 @@ def inform_kernel(
     """Add the information of one target in view for one vehicle. Grid: (worlds, its targets).
 
     That is M = C^T Q C and r = C^T Q (y - C_2 phat) in two blocks. Leaders have their corrected estimate of this tick
-    already.
+    already. Sights, positions and rotations are copies of those of this tick, as the way back needs them.
     """
     world, n = wp.tid()
     target = model.targets[vehicle, n]
@@ -156,13 +158,13 @@ def inform_kernel(
     camera = model.camera[vehicle]
     origin = own.position + own.rotation * camera.position
     marker = model.scene.marker[target]
-    place = state.position[world, target] + state.rotation[world, target] * marker
+    place = position[world, target] + rotation[world, target] * marker
     known = place
     if target >= model.landmarks:
         other = target - model.landmarks
         place = truth[world, other].position + truth[world, other].rotation * marker
         known = corrected[world, other].rotation * (corrected[world, other].position + marker)
-    if state.sight[world, vehicle, target] == VISIBLE:
+    if sight[world, vehicle, target] == VISIBLE:
         b = wp.transpose(own.rotation) * wp.normalize(place - origin)
         a = wp.transpose(predicted[world, vehicle].rotation) * known
         e = a - camera.position - predicted[world, vehicle].position
@@ -335,8 +337,9 @@ class DifferentiableWorld:
         sums = [self._make(mat66), self._make(mat23)]
         self._launch(predict_kernel, [world.model, held, belief, predicted, dt])
         counts = world.model.target_count.numpy()
+        scene = [wp.clone(part) for part in (world.state.sight, world.state.position, world.state.rotation)]
         for vehicle in self._order:
-            seen = [world.model, world.state, truth, predicted, after, vehicle, *sums]
+            seen = [world.model, *scene, truth, predicted, after, vehicle, *sums]
             self._launch(inform_kernel, seen, dim=(world.worlds, int(counts[vehicle])))
             self._launch(correct_kernel, [predicted, *sums, after, vehicle, dt, turn], dim=world.worlds)
         return after
