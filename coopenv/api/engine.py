@@ -29,7 +29,7 @@ from coopenv.observers.contract import Estimate
 from coopenv.observers.group import ObserverError, ObserverGroup
 from coopenv.observers.mailbox import Interference, interference_of
 from coopenv.observers.recording import Sensed
-from coopenv.observers.registry import find
+from coopenv.observers.registry import find, states_covariance
 from coopenv.scenario import Scenario
 from coopenv.viz.scene import Frame
 from coopenv.world.embedded import HOST
@@ -395,7 +395,7 @@ class PlugIns:
     """A group of observers per world.
 
     Estimates are written into the world's state, from which observations, rewards and metrics follow as for the
-    embedded observer. For an observer without covariance the scenario's P(0) is kept.
+    embedded observer. An estimate without covariance leaves that of the start, and of a matrix of gains P(0).
     """
 
     def __init__(self, name: str, world: SensingWorld) -> None:
@@ -429,6 +429,9 @@ class PlugIns:
             position = (rotation @ np.array(p[w], dtype=float)[..., None])[..., 0]
             with self._naming_the_observer():
                 self.groups[w].start(rotation, position, self._interference(w, 0))
+            if states_covariance(self.name):
+                poses = zip(rotation, position, self._world.observer_init.start_covariance, strict=True)
+                self._world.view("covariance")[w] = [riccati_covariance(Coordinates.LEFT, *each) for each in poses]
 
     def load(self) -> None:
         """Load the kernels of the stages, see `World.load`."""

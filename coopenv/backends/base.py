@@ -246,6 +246,8 @@ class SensingWorld(World, ABC):
         """(N,) ticks of the decision under way whose row came late."""
         self.missing = np.zeros(self.model.vehicles, dtype=np.int64)
         """(N,) ticks of it of which nothing came."""
+        self.missing_in_all = np.zeros(self.model.vehicles, dtype=np.int64)
+        """(N,) the same since the reset."""
 
     @cached_property
     def observer_init(self) -> ObserverInit:

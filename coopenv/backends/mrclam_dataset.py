@@ -199,6 +199,7 @@ class Robot:
     those of one time are one camera frame."""
     truth: MotionCapture  # for judging, and for starting where an observer is given its start
     skipped: int  # detections left out because no robot carries their barcode (misread by the camera)
+    outside: int = 0  # detections left out because no robot has odometry yet, or has any more
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -231,7 +232,7 @@ def load_dataset(name: str, data: str | Path | None = None) -> Dataset:
         if (apart := abs(start - starts[0])) > MAX_LENGTH_S:
             odometry.refuse(0, f"{apart:g} s apart from Robot1_Odometry.dat, at most {MAX_LENGTH_S:g}")
     origin, end = min(starts), max(float(odometry.values[-1, 0]) for _, odometry, _ in tables)
-    robots = tuple(_robot(name, robot, origin, known, *tables[i]) for i, robot in enumerate(ROBOTS))
+    robots = tuple(_robot(name, robot, (origin, end), known, *tables[i]) for i, robot in enumerate(ROBOTS))
     dataset = Dataset(name, end - origin, landmarks, robots)
     if remarks := _remarks_on(dataset, [table for three in tables for table in three]):
         warnings.warn(DataWarning(f"{name}: {'; '.join(remarks)}"), stacklevel=2)
@@ -240,12 +241,15 @@ def load_dataset(name: str, data: str | Path | None = None) -> Dataset:
 
 def _remarks_on(dataset: Dataset, tables: list[Rows]) -> list[str]:
     """Return which robots saw nothing, and what of the files was left out or put in order."""
-    skipped = sum(robot.skipped for robot in dataset.robots)
-    used = sum(len(robot.detections) for robot in dataset.robots)
+    skipped, outside = (sum(getattr(robot, name) for robot in dataset.robots) for name in ("skipped", "outside"))
+    total = skipped + outside + sum(len(robot.detections) for robot in dataset.robots)
     blind = [str(robot.subject) for robot in dataset.robots if not len(robot.detections)]
     remarks = [f"no detections of robot {', '.join(blind)}"] if blind else []
     if skipped:
-        remarks.append(f"{skipped} of {skipped + used} detections left out: no robot carries their barcode")
+        remarks.append(f"{skipped} of {total} detections left out: no robot or landmark of the map has their barcode")
+    if outside:
+        time = f"0 to {dataset.duration_s:.0f} s, in which there is odometry"
+        remarks.append(f"{outside} of {total} detections left out: not within {time}")
     for what, count in (("rows that stood too late put in order", "late"), ("rows with NaN left out", "unknown")):
         counts = [f"{number} of {table.path.name}" for table in tables if (number := getattr(table, count))]
         remarks += [f"{what}: {', '.join(counts)}"] if counts else []
@@ -286,26 +290,36 @@ def _tables(folder: Path, robot: int) -> tuple[Rows, Rows, Rows]:
     seen = timed(folder / f"Robot{robot}_Measurement.dat", 4, least=0)
     for row in np.flatnonzero(seen.values[:, 2] < 0).tolist():
         seen.refuse(row, f"negative range {seen.values[row, 2]:g}")
+    for row in np.flatnonzero(np.abs(seen.values[:, 3]) > 2.0 * np.pi).tolist():
+        seen.refuse(row, f"bearing {seen.values[row, 3]:g}, expected radians, -pi to pi")
     return truth, odometry, seen
 
 
 def _robot(
-    name: str, subject: int, origin: float, barcodes: dict[int, int], truth: Rows, odometry: Rows, seen: Rows
+    name: str,
+    subject: int,
+    recorded: tuple[float, float],
+    barcodes: dict[int, int],
+    truth: Rows,
+    odometry: Rows,
+    seen: Rows,
 ) -> Robot:
+    """Return a robot from its tables; `recorded` is from when to when, s, there is odometry of any robot."""
     subjects = np.array([barcodes.get(barcode, 0) for barcode in seen.whole(1)], dtype=np.float64)
-    clock = np.array([origin, 0.0, 0.0, 0.0])
+    clock = np.array([recorded[0], 0.0, 0.0, 0.0])
     detections = np.column_stack([seen.values[:, 0], subjects, seen.values[:, 2:]]) - clock
     _, first = np.unique(truth.values[:, 0], return_index=True)  # a repeated time stamp counts once
     rows = truth.values[first] - clock
     spans = [rows[0, 0] + np.array(span) for span in CORRUPT_HEADING.get((name, subject), ())]
     corrupt = tuple((float(start), float(end)) for start, end in spans)
-    known = subjects > 0
+    known, within = subjects > 0, (seen.values[:, :1] - recorded).prod(axis=1) <= 0.0
     return Robot(
         subject,
         odometry.values - clock[:3],
-        detections[known],
+        detections[known & within],
         MotionCapture(rows[:, 0], rows[:, 1:3], np.unwrap(rows[:, 3]), corrupt),
         int(np.count_nonzero(~known)),
+        int(np.count_nonzero(known & ~within)),
     )
 
 

@@ -84,6 +84,7 @@ class TickWorld(SensingWorld):
         self._present = _nothing(self.observer_init)
         self._adopted.clear()
         self._clear_marks()
+        self.missing_in_all[:] = 0
         self._take(self._backend.reset(None if keys is None or keys[0] is None else int(keys[0]), options or {}), 0)
         if isinstance(self._backend, Repeating):
             key, episode = self._backend.drawn
@@ -152,6 +153,7 @@ class TickWorld(SensingWorld):
         self._feed.fill(now, (now if k == 0 else last).truth or unknown_truth(now))
         self.late += now.late
         self.missing += now.missing
+        self.missing_in_all += now.missing
 
     def _completed(self, tick: Sensed) -> Sensed:
         """Return a sealed tick without gaps: a missing vehicle continues with its last odometry."""

@@ -26,7 +26,7 @@ from coopenv.observers.contract import Factory
 from coopenv.observers.registry import states_covariance, with_observer
 from coopenv.policies import Policy
 from coopenv.runs.bundle import RECORD_FILE, RunRecord
-from coopenv.runs.console import Progress, compile_notice, estimates_table, legend, metrics_table, rates, remarks
+from coopenv.runs.console import Progress, compile_notice, estimates_table, gaps, legend, metrics_table, rates, remarks
 from coopenv.runs.films import VIDEO_FILES, top_view_film, video_path, write_film
 from coopenv.runs.rollouts import Rollout, estimates, run_metrics, theory_rates, vehicle_metrics
 from coopenv.runs.scenes import Keeper, frame_stride, source_of, write_page
@@ -317,6 +317,7 @@ class Results(Tabular):
             yield f"{note}; all of them: {METRICS_FILE}"
         yield ""
         yield from rates(vehicles)
+        yield from gaps(self.metrics, len(self.trajectory.t), end)
         yield from legend(self.steady_from, end, self.trajectory.nees_dof)
         yield from remarks(vehicles)
 

@@ -3,7 +3,7 @@
 import math
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from math import inf, isnan, nan
 from time import monotonic
@@ -222,6 +222,16 @@ def legend(steady_from: float, end: float, nees_dof: int) -> Iterator[str]:
         yield f"RMSE and NEES: steady state, after {steady_from:g} s. NEES of a consistent estimate: {nees_dof}."
     else:
         yield f"No steady state: it would begin at {steady_from:g} s (see --steady-from)."
+
+
+def gaps(metrics: Mapping[str, Any], judged: int, until: float) -> Iterator[str]:
+    """Yield what a recording lacks: truth, so that `judged` ticks up to a time, s, count, and measurements."""
+    total = metrics.get("ticks", 0) + 1
+    if judged < total:
+        yield f"Judged at {judged} of {total} ticks, up to {until:g} s: at the others a true pose is not known."
+    for vehicle, ticks in metrics.get("missing_ticks", {}).items():
+        if ticks > 0.01 * total:
+            yield f"{vehicle}: no odometry at {ticks} of {total} ticks; its last was kept, and no bearing was used"
 
 
 def remarks(vehicles: list[dict[str, Any]]) -> Iterator[str]:

@@ -17,6 +17,7 @@ import coopenv
 import coopenv.observers.registry as registry
 from coopenv import CoopenvError
 from coopenv.api.engine import Engine
+from coopenv.estimation.poses import riccati_covariance
 from coopenv.observers import Coordinates, Estimate, Setup, Tick, find, register, run
 from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.runs.recorder import record
@@ -213,3 +214,15 @@ def test_robots_on_a_plane_have_theirs_on_the_host(tmp_path: Path) -> None:
     while env.agents:
         observation = env.step({agent: np.zeros(2, dtype=np.float32) for agent in env.agents})[0]
     assert all(np.isfinite(value).all() for value in observation.values())
+
+
+def test_a_plugin_begins_with_the_covariance_of_its_start() -> None:
+    """So do the infos and figures of t = 0; P of the paper's observer, which is none, is that of its gains."""
+    for name, states in (("mekf_covariance", True), ("riccati", False)):
+        env = coopenv.parallel_env("open_square", dtype="float64", overrides={"observer.name": name})
+        _, infos = env.reset(seed=0)
+        start = env.engine.world.observer_init.start_covariance
+        for P, info in zip(start, infos.values(), strict=True):
+            estimate = info["estimate"]
+            expected = riccati_covariance(Coordinates.LEFT, estimate["rotation"], estimate["position"], P)
+            assert np.allclose(estimate["covariance"], expected, rtol=1e-9, atol=1e-12) == states

@@ -267,5 +267,26 @@ def test_what_is_of_no_use_is_told(tmp_path):
     with pytest.warns(DataWarning) as caught:
         robot = load_dataset("mrclam_6", folder).robots[1]
     assert (robot.skipped, len(robot.detections)) == (own - 1, 1)
-    said = f"{own - 1} of {seen} detections left out: no robot carries their barcode"
+    said = f"{own - 1} of {seen} detections left out: no robot or landmark of the map has their barcode"
     assert [str(w.message) for w in caught] == [f"mrclam_6: no detections of robot 5; {said}"]
+
+
+def test_detections_beyond_the_odometry_are_left_out_and_told(tmp_path):
+    folder = write(tmp_path, seconds=6.0)
+    path = folder / "Robot2_Measurement.dat"
+    table, others = np.loadtxt(path), [len(robot.detections) for robot in load_dataset("mrclam_6", folder).robots]
+    for late in (-3.0, 3600.0):
+        np.savetxt(path, table + np.array([late, 0.0, 0.0, 0.0]), fmt="%.6f")
+        with pytest.warns(DataWarning, match=r"left out: not within 0 to \d s, in which there is odometry$"):
+            robot = load_dataset("mrclam_6", folder).robots[1]
+        assert robot.outside > 0 and robot.outside + len(robot.detections) == others[1]
+        assert ((robot.detections[:, 0] >= 0.0) & (robot.detections[:, 0] <= 6.1)).all()
+
+
+def test_bearings_in_degrees_are_refused(tmp_path):
+    path = write(tmp_path, seconds=6.0) / "Robot2_Measurement.dat"
+    table = np.loadtxt(path)
+    table[:, 3] = np.degrees(table[:, 3])
+    np.savetxt(path, table, fmt="%.6f")
+    with pytest.raises(DataError, match=r"Robot2_Measurement.dat:\d+: bearing .*, expected radians, -pi to pi$"):
+        load_dataset("mrclam_6", path.parent)

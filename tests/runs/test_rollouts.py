@@ -22,7 +22,7 @@ from coopenv.estimation.metrics import CONVERGED
 from coopenv.estimation.observability import Trajectory, analyse_observability
 from coopenv.policies import load_agent
 from coopenv.runs import Rollout, rollout
-from coopenv.runs.console import legend, metrics_table, rates, remarks
+from coopenv.runs.console import gaps, legend, metrics_table, rates, remarks
 from coopenv.runs.recorder import drive_vehicles
 from coopenv.runs.rollouts import Ending, outcome_line, run_metrics, theory_rates, vehicle_metrics
 from tests.helpers.commands import printed, refused
@@ -222,6 +222,15 @@ def test_the_table_has_a_row_per_vehicle_and_a_legend() -> None:
         "Settles: stays below 0.5 m and 5 deg. Converges: stays below 0.1 m and 1 deg.",
         "RMSE and NEES: steady state, after 5 s. NEES of a consistent estimate: 6.",
     ]
+
+
+def test_what_a_recording_lacks_is_told() -> None:
+    metrics = {"ticks": 99, "missing_ticks": {"vehicle_1": 1, "vehicle_2": 20}}
+    assert [*gaps(metrics, 60, 2.5)] == [
+        "Judged at 60 of 100 ticks, up to 2.5 s: at the others a true pose is not known.",
+        "vehicle_2: no odometry at 20 of 100 ticks; its last was kept, and no bearing was used",
+    ]
+    assert [*gaps(metrics | {"missing_ticks": {}}, 100, 9.9)] == []
 
 
 def test_what_odometry_carries_is_told_apart() -> None:
