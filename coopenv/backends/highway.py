@@ -1,9 +1,8 @@
 """highway-env as a co-simulator: its roads, traffic and dynamics under this project's cameras, radio and observers."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -91,36 +90,6 @@ def _unknown_to_it(s: Scenario) -> Iterator[str]:
         yield "action.pan: cameras of vehicles of highway-env do not turn"
 
 
-@cache
-def traffic_types() -> dict[str, type]:
-    """Return the classes of vehicles of highway-env's traffic, by name.
-
-    Environments of highway-env set parameters of the class of their traffic, and with it those of every other
-    environment in the process. Classes of our own keep worlds of one program from changing one another.
-    """
-    from highway_env.vehicle.behavior import IDMVehicle
-
-    class IntersectionTraffic(IDMVehicle):  # type: ignore[misc]
-        """Traffic whose parameters its environment sets at each reset, always the same."""
-
-    class Traffic(IDMVehicle):  # type: ignore[misc]
-        """Traffic with highway-env's own parameters, whatever others have made of their class."""
-
-        DISTANCE_WANTED = 5.0 + IDMVehicle.LENGTH  # m
-        COMFORT_ACC_MAX = 3.0  # m/s^2
-        COMFORT_ACC_MIN = -5.0  # m/s^2
-
-    return {"IntersectionTraffic": IntersectionTraffic, "Traffic": Traffic}
-
-
-if not TYPE_CHECKING:  # highway-env finds a class by its path
-
-    def __getattr__(name):
-        if name not in ("IntersectionTraffic", "Traffic"):
-            raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-        return traffic_types()[name]
-
-
 def _changed(part: Dynamics | None) -> set[str]:
     """Return the keys that differ from their defaults; a scenario in a file of results has all of its defaults."""
     return {name for name, field in Dynamics.model_fields.items() if part and getattr(part, name) != field.default}
@@ -167,7 +136,7 @@ def _config(scenario: Scenario, section: Highway, defaults: Mapping[str, Any]) -
         "dynamical": section.dynamical,
     }
     return {
-        "other_vehicles_type": f"{__name__}.{kind}",
+        "other_vehicles_type": f"coopenv.backends.highway_traffic.{kind}",
         **{key: list(value) if isinstance(value, tuple) else value for key, value in section.config.items()},
         "action": {"type": "MultiAgentAction", "action_config": drive},
         "observation": {"type": "AttributesObservation", "attributes": []},
