@@ -10,6 +10,7 @@ Source of the line: Sen, Estimates of the regression coefficient based on Kendal
 Statistical Association 63, 1968.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Any
@@ -199,30 +200,40 @@ def lead_by(residual: Residual, times: Array, most: float, least: float, *, scal
 
     There is none either if its root mean square is above `most`. `least` is added to the error; `scaled` as in `fit`.
     """
-    if len(times) < FEWEST:
+    tried = np.arange(-SEARCHED, SEARCHED + STEP / 2, STEP)
+    # Costs of different elements cannot be compared: only those count for which there is a value at every offset.
+    common = np.logical_and.reduce([np.isfinite(np.column_stack(residual(o))).all(axis=1) for o in tried[::5]])
+    if common.sum() < FEWEST:
         return None
 
+    def compared(offset: float) -> tuple[Array, Array]:
+        difference, explained = residual(offset)
+        return np.where(common, difference, np.nan), explained
+
     def cost(offset: float) -> float:
-        rest, w = fit(*residual(offset), scaled=scaled)
+        rest, w = fit(*compared(offset), scaled=scaled)
         return float((w * rest**2).sum() / w.sum()) if w.sum() >= FEWEST else np.inf
 
-    tried = np.arange(-SEARCHED, SEARCHED + STEP / 2, STEP)
     costs = np.array([cost(offset) for offset in tried])
     best, known = int(np.argmin(costs)), costs[np.isfinite(costs)]
     if best in (0, len(tried) - 1) or len(known) < len(tried) / 2:
         return None
     if costs[best] > min(UNEXPLAINED * known.max(), most**2):
         return None
+    blocks = max(1.0, float(np.ptp(times)) / BLOCK)
+    possible = np.flatnonzero(costs < costs[best] * math.exp(SURE**2 / blocks))  # by the ratio of likelihoods
+    if STEP * np.ptp(possible) > SEARCHED:  # as of an even speed: nearly any offset
+        return None
     offset, h = float(tried[best]), STEP / 4
     for _ in range(5):
-        rest, w = fit(*residual(offset))
-        slope = (fit(*residual(offset + h), w)[0] - fit(*residual(offset - h), w)[0]) / (2 * h)
+        rest, w = fit(*compared(offset))
+        slope = (fit(*compared(offset + h), w)[0] - fit(*compared(offset - h), w)[0]) / (2 * h)
         information = float((w * slope**2).sum())
         if information <= 0.0:
             return None
         offset -= float(np.clip((w * slope * rest).sum() / information, -STEP, STEP))
-    blocks = np.bincount(((times - times.min()) / BLOCK).astype(int), w * slope * rest)
-    return Lead(offset, float(np.hypot(np.sqrt((blocks**2).sum()) / information, least)))
+    sums = np.bincount(((times - times.min()) / BLOCK).astype(int), w * slope * rest)
+    return Lead(offset, float(np.hypot(np.sqrt((sums**2).sum()) / information, least)))
 
 
 def lead_of_motion(signal: Signal, reference: Signal, least: float = FLOOR) -> Lead | None:

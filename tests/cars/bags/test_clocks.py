@@ -128,6 +128,17 @@ def test_a_motion_that_tells_nothing_has_no_lead() -> None:
     assert lead_of_motion(noise, steady) is None and lead_of_motion(noise, Signal(t, heading(t))) is None
 
 
+@pytest.mark.parametrize("offset", [-0.6, 0.0, 0.4, 0.7])
+def test_an_even_speed_after_the_start_has_no_wrong_lead(offset: float) -> None:
+    """Without the start nearly any offset explains as much."""
+    t, rng = np.arange(0.0, 12.0, 0.02), np.random.default_rng(4)
+    speed = np.clip(0.8 * (t - 0.3), 0.0, 0.4)
+    truth = Signal(t, np.cumsum(speed) * 0.02 + rng.normal(0.0, 2e-4, len(t)))
+    wheel = Signal.of_rates(t - offset, 0.97 * speed * (1.0 + 0.02 * np.sin(0.4 * t)) + rng.normal(0.0, 2e-3, len(t)))
+    found = lead_of_motion(wheel, truth)
+    assert found is None or abs(found.seconds - offset) < 4.0 * found.error
+
+
 @pytest.fixture(scope="module")
 def drive() -> Recording:
     """Ten seconds of a car that turns both ways and stops."""
