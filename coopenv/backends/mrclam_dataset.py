@@ -64,7 +64,7 @@ class Rows:
         Where `gaps` are allowed, rows are left out that have NaN behind their first column.
         """
         try:
-            self.path, self._text = path, path.read_text(encoding="latin-1")
+            self.path, self._text = path, path.read_text(encoding="utf-8-sig", errors="replace")
         except OSError as error:
             why = f"cannot be read ({error.strerror})" if path.is_file() else "no such file"
             raise DataError(f"{path}: {why}") from None

@@ -121,6 +121,8 @@ def bundle(
     from coopenv.base.files import replacing_file
     from coopenv.runs.bundle import RECORD_FILE, Bundle
 
+    if run.is_dir() and not (run / RECORD_FILE).is_file():
+        raise CoopenvError(f"{run}: holds no {RECORD_FILE}, as only simulated runs do; send the recording instead")
     found = Bundle.read(run / RECORD_FILE)
     file = out or run.with_name(f"{run.name}{BUNDLE}")
     with replacing_file(file) as new:

@@ -163,7 +163,8 @@ def fit_exponential_rate(t: np.ndarray, error: np.ndarray, noise_floor: float | 
     floor = float(np.median(error[-max(1, len(error) // 5) :])) if noise_floor is None else noise_floor
     start = int(np.flatnonzero(median_filter(error, _FLICKER, mode="nearest") > half)[-1]) + 1
     if start == len(error) or 3 * floor >= half:
-        return _no_rate(f"error ends at {100 * floor / error[0]:.0f} % of its initial value")
+        where = "above" if floor > error[0] else f"at {100 * floor / error[0]:.0f} % of"
+        return _no_rate(f"error ends {where} its initial value")
     low = np.flatnonzero(error[start:] <= max(3 * floor, np.finfo(float).tiny))
     index = np.arange(start, start + low[0] if low.size else len(error))
     if len(index) < _FIT_SAMPLES_MIN:

@@ -185,7 +185,7 @@ def test_what_is_no_such_file_is_refused_in_one_line(folder: Path) -> None:
     (folder / "cut.zip").write_bytes(whole.read_bytes()[:2000])
     assert "cut.zip: not a readable run" in refused("run", "cut.zip")
     assert "no such scenario file: none.zip; expected a scenario" in refused("run", "none.zip")
-    assert "record.zip: not a readable run" in refused("bundle", ".")
+    assert "holds no record.zip, as only simulated runs do" in refused("bundle", ".")
     cases: list[tuple[Callable[[dict[str, bytes]], None], bool, str]] = [
         (lambda parts: arrays(parts, actions=np.zeros((4, 1, 2))), False, "arrays.npz: not the part that was written"),
         (lambda parts: arrays(parts, pack=np.savez_compressed), True, "arrays.npz: is packed twice"),

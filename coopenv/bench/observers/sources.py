@@ -158,7 +158,7 @@ class Robots(RecordSource):
     usual: ClassVar[tuple[str, ...]] = tuple(ROBOT_VARIANTS)
     windowed: ClassVar[bool] = False
     friendly: ClassVar[str] = (
-        "Friendly: robots start at their true pose and are judged from t = 0 on; who is seen is known from barcodes, "
+        "Friendly: robots start at their true pose; who is seen is known from barcodes, "
         "their own left out; the wheels' response was fitted to these robots; all receive from all, 10 Hz, no loss."
     )
     """What tables of recorded robots are to be read with."""
@@ -286,7 +286,7 @@ def find_source(
         ),
         f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9": data and not robots,
         f"--map {topics}: is for ROS bags, {text} is none": topics and not bag,
-        f"--override {next(iter(overrides or ()), '')}: {text} is recorded, it has no scenario to change": (
+        f"--override {next(iter(overrides or ()), '')}: {text} is recorded, and compared as it is": (
             overrides and not bag
         ),
         f"no such log file: {text}": not (bag or robots or path.is_file()),
