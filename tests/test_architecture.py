@@ -86,7 +86,7 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 LINES_AND_FILES = {
     ".": (123, 2),
-    "api": (4314, 19),
+    "api": (4321, 19),
     "backends": (3825, 17),
     "base": (1875, 10),
     "bench": (5345, 18),
@@ -100,7 +100,7 @@ LINES_AND_FILES = {
     "scenario": (3705, 12),
     "training": (1600, 6),
     "viz": (4830, 16),
-    "world": (5582, 18),
+    "world": (5593, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 MOST_FILES = 240

@@ -35,6 +35,7 @@ from coopenv.viz.scene import Frame
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
 from coopenv.world.model import device_memory
+from coopenv.world.quality import COORDINATES
 from coopenv.world.state import allocate, has_begun, overwrite, size_of
 from coopenv.world.world import Keys
 
@@ -395,7 +396,7 @@ class PlugIns:
     """A group of observers per world.
 
     Estimates are written into the world's state, from which observations, rewards and metrics follow as for the
-    embedded observer. An estimate without covariance leaves that of the start, and of a matrix of gains P(0).
+    embedded observer. Where an estimate has no covariance, the scenario's P(0) stands for it.
     """
 
     def __init__(self, name: str, world: SensingWorld) -> None:
@@ -430,8 +431,8 @@ class PlugIns:
             with self._naming_the_observer():
                 self.groups[w].start(rotation, position, self._interference(w, 0))
             if states_covariance(self.name):
-                poses = zip(rotation, position, self._world.observer_init.start_covariance, strict=True)
-                self._world.view("covariance")[w] = [riccati_covariance(Coordinates.LEFT, *each) for each in poses]
+                for vehicle, P in enumerate(self._world.observer_init.start_covariance):
+                    self._write_covariance(w, vehicle, Estimate(rotation[vehicle], position[vehicle], P))
 
     def load(self) -> None:
         """Load the kernels of the stages, see `World.load`."""
@@ -503,12 +504,18 @@ class PlugIns:
         R, view = np.asarray(estimate.rotation, dtype=float), self._world.view
         view("estimate_rotation")[w, vehicle] = R
         view("estimate_position")[w, vehicle] = R.T @ np.asarray(estimate.position, dtype=float)
-        if estimate.covariance is not None:
-            self._world.model.of_paper = int(estimate.coordinates is Coordinates.RICCATI)
-            view("covariance")[w, vehicle] = riccati_covariance(
-                estimate.coordinates, estimate.rotation, estimate.position, estimate.covariance
-            )
+        self._write_covariance(w, vehicle, estimate)
         view("protection_level")[w, vehicle] = 0.0 if estimate.protection_level is None else estimate.protection_level
+
+    def _write_covariance(self, w: int, vehicle: int, estimate: Estimate) -> None:
+        gains, P, coordinates = self._world.model.observer, estimate.covariance, Coordinates.RICCATI
+        if P is None:
+            kept = np.diag(np.repeat([float(gains.p1), float(gains.p2)], 3))
+        else:
+            coordinates = estimate.coordinates
+            kept = riccati_covariance(coordinates, estimate.rotation, estimate.position, P)
+        self._world.view("covariance")[w, vehicle] = kept
+        self._world.view("coordinates")[w, vehicle] = COORDINATES.index(coordinates)
 
     def get_state(self) -> list[dict[str, Any]]:
         """Return a deep copy of every observer and message.

@@ -1,1 +1,1 @@
-"""Sources of ticks other than the simulator: recorded robots."""
+"""Sources of ticks: the simulator, recordings, and programs that move the vehicles."""

@@ -1,4 +1,4 @@
-"""One sub-dataset on a common clock: landmarks, and per robot odometry, detections and interpolated truth."""
+"""One sub-dataset of MR.CLAM on a common clock: landmarks, and per robot odometry, detections and truth."""
 
 import os
 import re

@@ -150,7 +150,7 @@ def inform_kernel(
     """Add the information of one target in view for one vehicle. Grid: (worlds, its targets).
 
     That is M = C^T Q C and r = C^T Q (y - C_2 phat) in two blocks. Leaders have their corrected estimate of this tick
-    already. Sights, positions and rotations are copies of those of this tick, as the way back needs them.
+    already. Sights, positions and rotations are copies of those of this tick, for the backward pass.
     """
     world, n = wp.tid()
     target = model.targets[vehicle, n]

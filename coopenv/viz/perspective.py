@@ -1,7 +1,7 @@
 """Perspective pictures of a scene: the image of a vehicle's camera, and 3-D pictures for films.
 
-The image has the projected targets, drawn from the true poses. 3-D pictures are lit and have shadows; VTK draws them
-without a display. Extra `film3d`.
+The image has the projected targets, drawn from the true poses. 3-D pictures are lit and have shadows; VTK, of the extra
+`film3d`, draws them without a display.
 """
 
 from typing import Any

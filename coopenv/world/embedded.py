@@ -167,7 +167,7 @@ def send_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int, 
     """Add nothing to the V2X pose estimate."""
 
 
-HOST = Embedded("host", estimate_nothing, start_nothing, send_nothing, coordinates=Coordinates.LEFT)
+HOST = Embedded("host", estimate_nothing, start_nothing, send_nothing)
 """In place of an observer that runs on the host (`coopenv.api.engine.PlugIns`)."""
 
 

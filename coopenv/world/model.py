@@ -350,7 +350,7 @@ def model_struct(p: Precision) -> Any:
         action_size: wp.int32  # numbers of an action
         pans: wp.int32  # whether the third is the camera's angle
         horizon_ticks: wp.int32
-        of_paper: wp.int32  # whether the observer states its covariance in the paper's coordinates
+        coordinates: wp.int32  # in which the observer states its covariance at first, see `coopenv.world.quality`
         kept: wp.int32  # agents that a vehicle keeps at a time, see `coopenv.world.nearby`; 0: all
         before_boxes: wp.int32  # entries before that of the first box: all landmarks, or none where some are kept
         listed: wp.int32  # where some are kept: 1: those in `targets`, which has as many columns, 0: those in range

@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import block3, cholesky6, identity3, join6, quaternion_vector, skew, smallest_eigenvalue6
+from coopenv.estimation.poses import Coordinates
 from coopenv.world.camera import VISIBLE, body_bearing, mapped_position
 from coopenv.world.nearby import agent_of, box_of_entry, entry_at, entry_count
 from coopenv.world.v2x import fresh
@@ -34,22 +35,30 @@ def normalised_error_squared(I11: Any, L21: Any, I22: Any, e1: Any, e2: Any):
     return square
 
 
+COORDINATES = (Coordinates.RICCATI, Coordinates.LEFT, Coordinates.RIGHT)
+"""Places in it are the numbers of coordinates in the state."""
+LEFT, RIGHT = (wp.constant(COORDINATES.index(each)) for each in (Coordinates.LEFT, Coordinates.RIGHT))
+
+
 @wp.func
-def observer_error(R: Any, position: Any, R_hat: Any, p_hat: Any, of_paper: bool):
+def observer_error(R: Any, position: Any, R_hat: Any, p_hat: Any, coordinates: int):
     """Return the error that P is about: (2 lambda, p - phat), Rtilde = Rhat^T R, p = R^T pbar (paper, sec. IV).
 
-    An observer that states its covariance in other coordinates knows nothing of terms of second order of these, which
-    grow with the distance from the map's origin. Its error (theta, rho), R = Rhat Exp(theta), pbar = Rhat (phat + rho),
-    is brought to them as its covariance is, see `coopenv.estimation.poses.riccati_covariance`.
+    A covariance stated in other coordinates is kept to first order, see `coopenv.estimation.poses.riccati_covariance`.
+    Its error is brought here in the same way: terms of second order grow with the distance from the map's origin.
     """
-    lam = quaternion_vector(wp.transpose(R_hat) * R)
+    R_tilde = wp.transpose(R_hat) * R
+    lam = quaternion_vector(R_tilde)
     e1 = lam * p_hat.dtype(2.0)
-    if of_paper:
-        return e1, wp.transpose(R) * position - p_hat
+    e2 = wp.transpose(R) * position - p_hat
     sine = wp.length(lam)
-    if sine > p_hat.dtype(1e-4):
-        e1 *= wp.asin(wp.min(sine, p_hat.dtype(1.0))) / sine
-    return e1, wp.transpose(R_hat) * position - p_hat + wp.cross(p_hat, e1)
+    if coordinates != 0 and sine > p_hat.dtype(1e-4):
+        e1 *= wp.asin(wp.min(sine, p_hat.dtype(1.0))) / sine  # the rotation vector
+    if coordinates == LEFT:
+        e2 = wp.transpose(R_hat) * position - p_hat + wp.cross(p_hat, e1)
+    if coordinates == RIGHT:
+        e2 = R_tilde * e2
+    return e1, e2
 
 
 @wp.func

@@ -269,6 +269,7 @@ def set_initial_estimate(model: Any, state: Any, world: int, vehicle: int):
     state.estimate_position[world, vehicle] = wp.transpose(R) * position
     i3 = identity3(o)
     state.covariance[world, vehicle] = join6(model.observer.p1 * i3, type(R)(), type(R)(), model.observer.p2 * i3)
+    state.coordinates[world, vehicle] = model.coordinates
 
 
 @wp.func

@@ -375,6 +375,7 @@ def state_struct(p: Precision) -> Any:
         estimate_rotation: array("WN", mat33, ROTATION)  # Rhat
         estimate_position: array("WN", vec3)  # phat, in the body frame
         covariance: array("WN", mat66, COVARIANCE)  # P over (2 lambda, p)
+        coordinates: array("WN", wp.int32, whole(0, 2))  # in which it was stated, see `coopenv.world.quality`
         corrected_tick: array("WN", wp.int32, whole(0, "tick"))  # tick of the observer's last correction
         nis: array("WN", wp.float64, numbers(LARGEST**3))  # normalised innovation squared of its last tick, if given
         nis_dof: array("WN", wp.int32, whole(0, 10**6))  # degrees of freedom; 0: no correction, or not given

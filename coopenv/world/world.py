@@ -9,13 +9,14 @@ import warp as wp
 
 from coopenv.base.errors import CoopenvError, check_memory
 from coopenv.estimation import UNKNOWN, Sight
-from coopenv.estimation.poses import Coordinates, Rule
+from coopenv.estimation.poses import Rule
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
 from coopenv.world.launch import VEHICLES_PER_LEVEL, Call, Launcher, PerLane, PerWorld, threads_and_lanes
 from coopenv.world.model import check_device, device_memory, mat66d, precision
+from coopenv.world.quality import COORDINATES
 from coopenv.world.random import NOT_SET
 from coopenv.world.state import (
     ANYTHING,
@@ -110,7 +111,7 @@ class World:
         self.threads = max(shares, lanes) if self.device == "cpu" else 1
         self.observer = observer if observer.fit is None else observer.fit(self.model)
         """What estimates in the kernels; `HOST` where estimates are written from outside, see `PlugIns`."""
-        self.model.of_paper = int(self.observer.coordinates is Coordinates.RICCATI)
+        self.model.coordinates = COORDINATES.index(self.observer.coordinates)
         self.in_parts = self.device != "cpu" and len(self.observer.parts) > 1
         """Whether the observer's parts are kernels of their own; on the CPU that would only load a world's state more
         often."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ import coopenv
 import coopenv.observers.registry as registry
 from coopenv import CoopenvError
 from coopenv.api.engine import Engine
-from coopenv.estimation.poses import riccati_covariance
+from coopenv.estimation.metrics import nees
+from coopenv.estimation.poses import left_covariance, riccati_covariance
 from coopenv.observers import Coordinates, Estimate, Setup, Tick, find, register, run
 from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.runs.recorder import record
@@ -124,18 +126,21 @@ def test_the_environment_and_the_runner_agree(name: str) -> None:
     assert result.coordinates is not Coordinates.RICCATI and not result.failure
 
 
-def test_an_observer_without_covariance_leaves_that_of_the_start() -> None:
-    class Silent(DeadReckoning):
-        def update(self, tick: Tick) -> Estimate:
-            estimate = super().update(tick)
-            return Estimate(estimate.rotation, estimate.position)
+class Silent(DeadReckoning):
+    """States no covariance."""
 
+    def update(self, tick: Tick) -> Estimate:
+        return replace(super().update(tick), covariance=None)
+
+
+def test_for_an_observer_without_covariance_stands_p_of_0() -> None:
     register("silent", Silent)
     env = short("silent")
     _, before = env.reset(seed=0)
     _, _, _, _, after = env.step(still(env))
     for agent in after:
-        assert np.array_equal(before[agent]["estimate"]["covariance"], after[agent]["estimate"]["covariance"])
+        P = after[agent]["estimate"]["covariance"]
+        assert np.array_equal(P, np.diag(np.repeat(env.scenario.observer.P0, 3)))
         assert not np.array_equal(before[agent]["estimate"]["position"], after[agent]["estimate"]["position"])
 
 
@@ -217,8 +222,8 @@ def test_robots_on_a_plane_have_theirs_on_the_host(tmp_path: Path) -> None:
 
 
 def test_a_plugin_begins_with_the_covariance_of_its_start() -> None:
-    """So do the infos and figures of t = 0; P of the paper's observer, which is none, is that of its gains."""
-    for name, states in (("mekf_covariance", True), ("riccati", False)):
+    """So do the infos and figures of t = 0. P of `hamel_samson`, which is none, is P(0) of the gains."""
+    for name, states in (("mekf_covariance", True), ("hamel_samson", False)):
         env = coopenv.parallel_env("open_square", dtype="float64", overrides={"observer.name": name})
         _, infos = env.reset(seed=0)
         start = env.engine.world.observer_init.start_covariance
@@ -226,3 +231,31 @@ def test_a_plugin_begins_with_the_covariance_of_its_start() -> None:
             estimate = info["estimate"]
             expected = riccati_covariance(Coordinates.LEFT, estimate["rotation"], estimate["position"], P)
             assert np.allclose(estimate["covariance"], expected, rtol=1e-9, atol=1e-12) == states
+
+
+@pytest.mark.parametrize("observer", ["hamel_samson", "right_invariant", "mekf_covariance", Silent])
+def test_nees_is_in_the_coordinates_of_the_observer_also_of_a_restored_world(observer: Any) -> None:
+    """Three seconds from a start in error; without a covariance P is P(0)."""
+    env = coopenv.parallel_env(FOUR_WAY, observer=observer, dtype="float64")
+    env.reset(seed=4)
+    ahead = dict.fromkeys(env.agents, np.array([0.5, 0.1], np.float32))
+    for _ in range(10):
+        env.step(ahead)
+    restored = coopenv.parallel_env(FOUR_WAY, observer=observer, dtype="float64")
+    restored.reset(seed=99)
+    restored.set_state(env.get_state())
+    for _ in range(3):
+        infos, again = (each.step(ahead)[4] for each in (env, restored))
+        for agent, info in infos.items():
+            assert again[agent]["nees"] == info["nees"]
+    kind = Coordinates.RICCATI if observer is Silent else env.engine.plugins.groups[0].coordinates
+    for i, (agent, info) in enumerate(infos.items()):
+        truth, estimate = env.engine.view("rotation")[0, len(env.scenario.landmarks) + i], info["estimate"]
+        R, P = estimate["rotation"], estimate["covariance"]
+        stated = {
+            Coordinates.RICCATI: P,
+            Coordinates.LEFT: left_covariance(R.T @ estimate["position"], P),
+            Coordinates.RIGHT: np.kron(np.eye(2), R) @ P @ np.kron(np.eye(2), R.T),
+        }[kind]
+        e = kind.error(truth, info["truth"]["position"], R, estimate["position"])
+        assert info["nees"] == pytest.approx(float(nees(e, stated)), rel=1e-6), agent

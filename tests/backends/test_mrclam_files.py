@@ -290,3 +290,10 @@ def test_bearings_in_degrees_are_refused(tmp_path):
     np.savetxt(path, table, fmt="%.6f")
     with pytest.raises(DataError, match=r"Robot2_Measurement.dat:\d+: bearing .*, expected radians, -pi to pi$"):
         load_dataset("mrclam_6", path.parent)
+
+
+def test_a_file_may_have_a_byte_order_mark(tmp_path):
+    path = write(tmp_path, seconds=6.0) / "Robot2_Odometry.dat"
+    before = load_dataset("mrclam_6", path.parent).robots[1].odometry
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    np.testing.assert_array_equal(load_dataset("mrclam_6", path.parent).robots[1].odometry, before)

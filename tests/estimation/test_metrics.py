@@ -162,6 +162,7 @@ def test_rate_fit_starts_after_the_last_excursion() -> None:
             "error fell from half to the noise floor within 1 tick",
         ),
         (np.full(100, 4.0), "error ends at 100 % of its initial value"),
+        (np.append(1e-15, np.full(99, 3.0)), "error ends above its initial value"),
         (np.append(9.0, np.full(99, 3.0)), "error ends at 33 % of its initial value"),
         (np.append(9.0, np.full(99, np.inf)), "error is not finite"),
         (np.full(100, np.nan), "error is not finite"),

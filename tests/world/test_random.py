@@ -132,14 +132,21 @@ def log_determinant(P: Any):
 def judged(P: Any, R: Any, position: Any, R_hat: Any, p_hat: Any):
     """Return the observer's error coordinates and the NEES."""
     I11, L21, I22 = quality.cholesky_of(P)
-    e1, e2 = quality.observer_error(R, position, R_hat, p_hat, True)
+    e1, e2 = quality.observer_error(R, position, R_hat, p_hat, 0)
     return e1, e2, quality.normalised_error_squared(I11, L21, I22, e1, e2)
 
 
 @wp.func
 def nees_of_left(P: Any, R: Any, position: Any, R_hat: Any, p_hat: Any):
     I11, L21, I22 = quality.cholesky_of(P)
-    e1, e2 = quality.observer_error(R, position, R_hat, p_hat, False)
+    e1, e2 = quality.observer_error(R, position, R_hat, p_hat, quality.LEFT)
+    return quality.normalised_error_squared(I11, L21, I22, e1, e2)
+
+
+@wp.func
+def nees_of_right(P: Any, R: Any, position: Any, R_hat: Any, p_hat: Any):
+    I11, L21, I22 = quality.cholesky_of(P)
+    e1, e2 = quality.observer_error(R, position, R_hat, p_hat, quality.RIGHT)
     return quality.normalised_error_squared(I11, L21, I22, e1, e2)
 
 
@@ -149,6 +156,7 @@ of_quality = Calls(
         log_determinant: "66 > 1",
         judged: "66 33 3 33 3 > 3 3 1",
         nees_of_left: "66 33 3 33 3 > 1",
+        nees_of_right: "66 33 3 33 3 > 1",
         quality.position_variance: "66 3 > 1",
     },
 )
@@ -200,16 +208,21 @@ def test_error_coordinates_and_nees(angle: float | None) -> None:
 
 @pytest.mark.parametrize("away", [0.0, 1e3])
 @pytest.mark.parametrize("angle", [None, 1e-9, 1e-3, np.pi - 1e-6])
-def test_nees_of_other_coordinates_is_that_of_the_observer_anywhere(angle: float | None, away: float) -> None:
+@pytest.mark.parametrize(
+    ("nees", "coordinates"), [(nees_of_left, poses.Coordinates.LEFT), (nees_of_right, poses.Coordinates.RIGHT)]
+)
+def test_nees_of_other_coordinates_is_that_of_the_observer_anywhere(
+    nees: Any, coordinates: poses.Coordinates, angle: float | None, away: float
+) -> None:
     """Although the covariance is kept in the paper's, as far as their first order goes."""
     R, position, R_hat, p_hat = drawn_poses(1, angle)
     position = position + away
     estimate = np.einsum("nij,nj->ni", R_hat, p_hat) + away
     P = covariances(np.random.default_rng(2))
-    kept = [poses.riccati_covariance(poses.Coordinates.LEFT, *row) for row in zip(R_hat, estimate, P, strict=True)]
-    expected = metrics.nees(poses.Coordinates.LEFT.error(R, position, R_hat, estimate), P)
+    kept = [poses.riccati_covariance(coordinates, *row) for row in zip(R_hat, estimate, P, strict=True)]
+    expected = metrics.nees(coordinates.error(R, position, R_hat, estimate), P)
     arguments = np.array(kept), R, position, R_hat, np.einsum("nji,nj->ni", R_hat, estimate)
-    assert_allclose(of_quality(nees_of_left, "float64", *arguments), expected, rtol=0.01 if away else 2e-6)
+    assert_allclose(of_quality(nees, "float64", *arguments), expected, rtol=0.01 if away else 2e-6)
 
 
 def test_nees_by_hand() -> None:

@@ -189,7 +189,7 @@ def assess(model: Any, state: Any, results: Any, world: int, vehicle: int):
     results.position_error[world, vehicle] = wp.length(position - R_hat * p_hat)
     results.orientation_error[world, vehicle] = angle * type(angle)(DEGREES)
     I11, L21, I22 = cholesky_of(state.covariance[world, vehicle])
-    e1, e2 = observer_error(R, position, R_hat, p_hat, model.of_paper == 1)
+    e1, e2 = observer_error(R, position, R_hat, p_hat, state.coordinates[world, vehicle])
     results.nees[world, vehicle] = normalised_error_squared(I11, L21, I22, e1, e2)
     results.log_determinant[world, vehicle] = log_determinant(I11, I22)
     results.position_std[world, vehicle] = wp.sqrt(position_variance(state.covariance[world, vehicle], p_hat))

@@ -221,7 +221,7 @@ def lead_by(residual: Residual, times: Array, most: float, least: float, *, scal
     if costs[best] > min(UNEXPLAINED * known.max(), most**2):
         return None
     blocks = max(1.0, float(np.ptp(times)) / BLOCK)
-    possible = np.flatnonzero(costs < costs[best] * math.exp(SURE**2 / blocks))  # by the ratio of likelihoods
+    possible = np.flatnonzero(costs <= costs[best] * math.exp(SURE**2 / blocks))  # by the ratio of likelihoods
     if STEP * np.ptp(possible) > SEARCHED:  # as of an even speed: nearly any offset
         return None
     offset, h = float(tried[best]), STEP / 4

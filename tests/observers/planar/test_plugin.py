@@ -185,8 +185,8 @@ def test_a_robot_that_is_carried_off_notices_and_finds_itself(seed, at):
     lost = np.array(Watched.all[2].lost_at)
     assert lost.size and at <= lost[0] < at + 25.0 and lost[-1] < at + 55.0
     assert all(message.position is None and message.size_bytes == 0 for message in Watched.all[2].sent)
-    at = np.isin(np.round(result.t, 6), np.round(lost, 6))
-    std = np.sqrt(np.diagonal(result.covariance[at, 2], axis1=1, axis2=2))
+    there = np.isin(np.round(result.t, 6), np.round(lost, 6))
+    std = np.sqrt(np.diagonal(result.covariance[there, 2], axis1=1, axis2=2))
     assert (std[:, 2] > 1.0).all() and (std[:, 3:5] > 3.0).all()  # it says that it does not know
     end = result.t > at + 62.0
     assert np.sqrt(np.mean(result.position_error[end, 2] ** 2)) < 0.4

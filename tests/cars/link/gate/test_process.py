@@ -241,7 +241,7 @@ def test_mistakes_are_told_in_one_line(
 def test_it_loads_neither_the_simulation_nor_numpy() -> None:
     code = (
         "import sys; sys.argv[0] = 'coopenv'\n"  # the package does not register environments for its own command
-        "import coopenv.cars.gate_process, coopenv.cars.gate_process, coopenv.cars.keys\n"
+        "import coopenv.cars.gate, coopenv.cars.gate_process, coopenv.cars.keys\n"
         "import coopenv.cars.deployment, coopenv.cars.transport.zenoh\n"
         "print(*sys.modules)"
     )
