@@ -335,7 +335,7 @@ def run_metrics(
         "versions": {"coopenv": version(), "warp": wp.__version__, "numpy": np.__version__, "python": python_version()},
         "outcome": outcome_line(run),
         "ticks": run.ticks_recorded,
-        "missing_ticks": dict(zip(run.scenario.vehicle_names, run.engine.world.missing_in_all.tolist(), strict=True)),
+        "missing_ticks": {run.scenario.vehicle_names[i]: int(run.engine.world.missing_in_all[i]) for i in run.vehicles},
         "simulated_time_s": simulated,
         "wall_time_s": run.wall_time,
         "real_time_factor": simulated / run.wall_time,
