@@ -85,12 +85,12 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
         pass
 
     @device_function
-    def no_gate(memory: Any, world: int, i: int, bearings: int):  # type: ignore[no-untyped-def]
+    def no_joint_gate(memory: Any, world: int, i: int, bearings: int):  # type: ignore[no-untyped-def]
         correction.correct_by_bearings(memory, world, i, bearings, False)
 
     return {
         "nothing": [],
-        "gate of bearings": [(correction, "gate_jointly", no_gate)],
+        "joint gate of bearings": [(correction, "gate_jointly", no_joint_gate)],
         "all monitors": [(constants, "FAULT_GATE", 1e30)],
         "monitors of the own sensors": [(constants, "OWN_FAULT", 1e-9)],
         "monitors of landmarks": [(measurements, "take_slot", no_landmark)],
