@@ -90,7 +90,7 @@ LINES_AND_FILES = {
     "backends": (3825, 17),
     "base": (1875, 10),
     "bench": (5345, 18),
-    "cars": (10757, 39),
+    "cars": (10759, 39),
     "cli": (2630, 8),
     "estimation": (1881, 7),
     "evaluation": (495, 3),
@@ -100,7 +100,7 @@ LINES_AND_FILES = {
     "scenario": (3705, 12),
     "training": (1600, 6),
     "viz": (4830, 16),
-    "world": (5593, 18),
+    "world": (5595, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 MOST_FILES = 240

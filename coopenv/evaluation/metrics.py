@@ -73,9 +73,6 @@ class Quantile:
         """Return the figure, (R,), for multiplicities of the worlds, (R, W); NaN where none has a value."""
         if len(self._edges) < 2:
             return np.where(counts @ self._seen[:, 0] > 0, self.value, np.nan)
-        few = counts.shape[1] < 8  # the same multiplicities are then drawn again and again
-        if few and len((unique := np.unique(counts, axis=0, return_inverse=True))[0]) < len(counts):
-            return np.asarray(self.resampled(unique[0])[unique[1].ravel()])
         reached = np.cumsum(counts @ self._seen, axis=1)
         wanted = self._share * reached[:, -1:]
         place = np.argmax(reached >= wanted, axis=1)[:, None]

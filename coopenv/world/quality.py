@@ -37,22 +37,24 @@ def normalised_error_squared(I11: Any, L21: Any, I22: Any, e1: Any, e2: Any):
 
 COORDINATES = (Coordinates.RICCATI, Coordinates.LEFT, Coordinates.RIGHT)
 """Places in it are the numbers of coordinates in the state."""
-LEFT, RIGHT = (wp.constant(COORDINATES.index(each)) for each in (Coordinates.LEFT, Coordinates.RIGHT))
+RICCATI, LEFT, RIGHT = (wp.constant(number) for number in range(len(COORDINATES)))
 
 
 @wp.func
 def observer_error(R: Any, position: Any, R_hat: Any, p_hat: Any, coordinates: int):
-    """Return the error that P is about: (2 lambda, p - phat), Rtilde = Rhat^T R, p = R^T pbar (paper, sec. IV).
+    """Return the error that P is about, rad and m: (2 lambda, p - phat), of Rtilde = Rhat^T R and p = R^T pbar.
 
     A covariance stated in other coordinates is kept to first order, see `coopenv.estimation.poses.riccati_covariance`.
     Its error is brought here in the same way: terms of second order grow with the distance from the map's origin.
+
+    Source: the paper, section IV; for the other coordinates `coopenv.estimation.poses.Coordinates`.
     """
     R_tilde = wp.transpose(R_hat) * R
     lam = quaternion_vector(R_tilde)
     e1 = lam * p_hat.dtype(2.0)
     e2 = wp.transpose(R) * position - p_hat
     sine = wp.length(lam)
-    if coordinates != 0 and sine > p_hat.dtype(1e-4):
+    if coordinates != RICCATI and sine > p_hat.dtype(1e-4):
         e1 *= wp.asin(wp.min(sine, p_hat.dtype(1.0))) / sine  # the rotation vector
     if coordinates == LEFT:
         e2 = wp.transpose(R_hat) * position - p_hat + wp.cross(p_hat, e1)

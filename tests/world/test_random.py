@@ -132,7 +132,7 @@ def log_determinant(P: Any):
 def judged(P: Any, R: Any, position: Any, R_hat: Any, p_hat: Any):
     """Return the observer's error coordinates and the NEES."""
     I11, L21, I22 = quality.cholesky_of(P)
-    e1, e2 = quality.observer_error(R, position, R_hat, p_hat, 0)
+    e1, e2 = quality.observer_error(R, position, R_hat, p_hat, quality.RICCATI)
     return e1, e2, quality.normalised_error_squared(I11, L21, I22, e1, e2)
 
 

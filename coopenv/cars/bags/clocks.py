@@ -200,6 +200,8 @@ def lead_by(residual: Residual, times: Array, most: float, least: float, *, scal
 
     There is none either if its root mean square is above `most`. `least` is added to the error; `scaled` as in `fit`.
     """
+    if len(times) < FEWEST:
+        return None
     tried = np.arange(-SEARCHED, SEARCHED + STEP / 2, STEP)
     # Costs of different elements cannot be compared: only those count for which there is a value at every offset.
     common = np.logical_and.reduce([np.isfinite(np.column_stack(residual(o))).all(axis=1) for o in tried[::5]])
