@@ -12,6 +12,7 @@ from coopenv.base import interrupts
 def main() -> int:
     """Run the command line of this process and return its exit status."""
     gc.set_threshold(100_000)  # imports and scenarios make many objects that stay
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small, and threads take a fifth of `coopenv list`
     interrupts.install()
     sys.stderr = sys.stderr or Path(os.devnull).open("w")  # noqa: SIM115 (libraries write to a closed one too)
     for stream in (sys.stdout, sys.stderr):

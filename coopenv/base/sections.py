@@ -29,7 +29,7 @@ class Section(BaseModel):
     of them takes a third of the time to import the schema.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
     def __setattr__(self, name: str, value: Any = None) -> None:
         """Refuse a change; overrides of `load_scenario` return a changed copy."""
