@@ -202,7 +202,7 @@ def compiler_options() -> dict[str, Any]:
         return {}
     kept = [flag for flag in flags if not flag.startswith("-mllvm")]
     threshold = f"-mllvm=-inline-threshold={INLINE_THRESHOLD}"
-    return {"cpu_compiler_flags": " ".join([*kept, threshold]), "optimization_level": 3}
+    return {"cpu_compiler_flags": " ".join([*kept, threshold])}
 
 
 def default_threads() -> int:

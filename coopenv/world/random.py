@@ -184,7 +184,7 @@ def draw_parameters(model: Any, state: Any, world: int):
     """Draw the factors of a world, but for those that somebody has set."""
     level = state.difficulty[world]
     one = type(level)(1.0)
-    for k in range(COUNT):
+    for k in range(model.drawn.low.shape[0]):
         factor = state.parameter_set[world, k]
         if factor < type(level)(0.0):
             words = random_words(state.seed[world], state.episode[world], 0, k, PARAMETER)
