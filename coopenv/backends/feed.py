@@ -27,7 +27,6 @@ from coopenv.world.embedded import Source, arrange_world, look_around, sense_not
 from coopenv.world.model import Precision
 from coopenv.world.nearby import NOT_A_NEIGHBOUR, sort_into_cells
 from coopenv.world.odometry import measure_odometry
-from coopenv.world.random import COUNT as PARAMETER_COUNT
 from coopenv.world.reset import begin_sensing, place_everybody, set_initial_estimate
 from coopenv.world.route import UNDER_WAY
 from coopenv.world.state import allocate, array, fields
@@ -154,7 +153,7 @@ def rewind(model: Any, state: Any, record: Any, world: int):
     if record.drawn != 0:
         state.seed[world] = record.key
         state.episode[world] = record.episode
-        for k in range(PARAMETER_COUNT):
+        for k in range(record.parameter.shape[0]):
             state.parameter_set[world, k] = record.parameter[k]
     place_everybody(model, state, world)
     for vehicle in range(model.vehicles):

@@ -174,7 +174,6 @@ TRAFFIC_PACE = wp.constant(_NUMBER["traffic_pace"])
 WANDER = wp.constant(_NUMBER["wander"])
 """Indices of the state's field `parameter`."""
 
-COUNT = wp.constant(len(PARAMETERS))
 NOT_SET = -1.0
 """In the state's field `parameter_set`: the factor is drawn."""
 
