@@ -1,11 +1,15 @@
 """Zenoh under the keys of zenoh-bridge-ros2dds (no leading slash, plain CDR), and the transport of a deployment."""
 
+import atexit
 import json
+import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
+from weakref import WeakSet
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, needing
@@ -33,6 +37,7 @@ class Zenoh:
     def __init__(self, session: Any, module: Any) -> None:
         self.session, self.library = session, module
         self._kept: list[Any] = []  # a declaration ends with its last reference
+        _sessions().add(self)
 
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
@@ -78,6 +83,22 @@ class Zenoh:
         self._kept.clear()
         if not self.session.is_closed():
             self.session.close()
+
+
+@cache
+def _sessions() -> WeakSet[Zenoh]:
+    """Return the sessions of this process, which end with its main thread: Zenoh's own threads would keep it alive."""
+    sessions: WeakSet[Zenoh] = WeakSet()
+
+    def close_all() -> None:
+        threading.main_thread().join()
+        for session in list(sessions):
+            session.close()
+
+    closing = threading.Thread(target=close_all, name="coopenv sessions", daemon=True)
+    closing.start()
+    atexit.register(closing.join)
+    return sessions
 
 
 def library() -> Any:

@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -44,6 +45,16 @@ def answered(client: Zenoh, heard: list[Arrival]) -> None:
     """Send pings until one comes back."""
     before = len(heard)
     wait_until(lambda: len(heard) > before, lambda: client.publish(PING, b"abc", b"signed"))
+
+
+@pytest.mark.parametrize("listen", ["subscribe", "watch"])
+def test_a_process_that_raises_ends_though_its_session_is_open(endpoint: str, listen: str) -> None:
+    script = f"""
+from coopenv.cars.transport.zenoh import open_zenoh
+open_zenoh("router", listen=["{endpoint}"]).{listen}("any/**", print)
+raise SystemExit(3)
+"""
+    assert subprocess.run([sys.executable, "-c", script], timeout=60).returncode == 3
 
 
 def test_two_processes_talk_and_a_killed_one_is_missed(endpoint: str, client: Zenoh) -> None:
