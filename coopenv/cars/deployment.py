@@ -12,11 +12,12 @@ from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
 from coopenv.base.sections import Section, read_toml, validated, with_tables
 from coopenv.cars.fake import USUAL as DEFAULT_FAKE
 from coopenv.cars.fake import FakeSettings
+from coopenv.cars.gate import TIMEOUT
 from coopenv.cars.profile import (
     SVEA,
     USUAL,
-    Brake,
     CarProfile,
+    CommandMessage,
     Limits,
     Number,
     Point,
@@ -201,9 +202,10 @@ class Sensors(Section):
 LIMITED = ("speed", "steering", "acceleration", "steering_rate")
 
 
-REACTION = 0.3
-"""s from a station's last command until neutral slows a car: the gate waits for 0.2 s; the rest is its period, and
-lags. Fakes that drove at 0.41 m/s stood after 0.74 s and 0.21 m (here 0.71 s, 0.21 m)."""
+LAG = 0.1
+"""s for the period of the gate and the lags of a car."""
+ROLLING = 1.0
+"""Deceleration of a car that is not braked, unless it is measured, m/s^2."""
 
 
 class Safety(Section):
@@ -227,7 +229,7 @@ class Safety(Section):
     """Corners of a polygon that no car may leave, m, in the coordinates of the environment's file (none: no fence)."""
     separation: float = Field(default=0.0, ge=0.0, le=100.0)
     """Least distance between a driven car and any other car of the fleet, m (0: not watched)."""
-    deceleration: Positive | None = None
+    deceleration: float | None = Field(default=None, ge=0.1, le=20.0)
     """Of a car that is stopped, m/s^2, by a test (default: of the profile's brake, or 1). Cars are stopped in time to
     stand inside the geofence, apart."""
     judge: Literal["truth", "estimate"] = "truth"
@@ -256,10 +258,19 @@ class Safety(Section):
     max_clock_offset: Positive = 0.02
     """Largest offset between the clocks of a car and of this computer for arming, s."""
 
-    def stopping(self, speed: float, brake: Brake | None) -> tuple[float, float]:
-        """Return after which time, s, and way, m, a car at a speed, m/s, stands that gets no more commands."""
-        rate = self.deceleration or (brake.deceleration if brake else 1.0)
-        return REACTION + speed / rate, speed * REACTION + speed**2 / (2.0 * rate)
+    def stopping(self, speed: float, command: CommandMessage) -> dict[str, tuple[float, float]]:
+        """Return by cause after which time, s, and way, m, a car at a speed, m/s, stands.
+
+        The gate sends neutral, or brakes; without it the autopilot lets the car roll.
+        """
+        rate = self.deceleration or (command.brake.deceleration if command.brake else ROLLING)
+        alone = min(rate, ROLLING) if command.brake else rate
+        causes = {
+            "station or radio silent": (1e-9 * TIMEOUT + LAG, rate),
+            "gate or its router silent": (command.timeout + LAG, alone),
+            "autopilot silent": (self.odometry_age + LAG, rate),
+        }
+        return {cause: (t + speed / a, speed * t + speed**2 / (2.0 * a)) for cause, (t, a) in causes.items()}
 
     @field_validator("geofence")
     @classmethod

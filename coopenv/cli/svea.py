@@ -196,9 +196,11 @@ def health(
             raise CoopenvError(f"{error}{hint}") from None
         refused = status.rejections.total()
         print(f"{car}: gate {status.state}, {status.accepted} commands accepted, {refused} messages refused")
-        v, brake = fleet.limits.speed, fleet.profile.command.brake
-        (after, way), by = fleet.safety.stopping(v, brake), " braking" if brake else ""
-        print(f"{car}: from {v:.3g} m/s to a stand {after:.2g} s and {way:.2g} m{by}, with safety.deceleration")
+        v, command = fleet.limits.speed, fleet.profile.command
+        for cause, (after, way) in fleet.safety.stopping(v, command).items():
+            print(
+                f"{car}: {cause}: from {v:.3g} m/s to a stand {after:.2g} s and {way:.2g} m, with safety.deceleration"
+            )
         if fleet.network.kind != "zenoh":
             print(f"{car}: network.kind = {fleet.network.kind} {UNTRIED}")
             return

@@ -362,7 +362,7 @@ class Watchdog:
                 yield car, f"{now:.2f} m from {other}{near}, {safety.separation:g} m is the least"
 
     def _way_to_stand(self, place: Place) -> Array:
-        """Return the vector (2,), m, along which a car rolls until it stands, if it is stopped."""
+        """Return the vector (2,), m, along which a car moves until it stands, by the cause of the longest way."""
         speed = float(np.linalg.norm(place.velocity[:2]))
-        way = self._safety.stopping(speed, self._gates.profile.command.brake)[1]
+        way = max(way for _, way in self._safety.stopping(speed, self._gates.profile.command).values())
         return place.velocity[:2] * (way / max(speed, 1e-9))

@@ -159,10 +159,10 @@ def test_fence_and_separation(places: dict[str, float], judge: Any, found: list[
 @pytest.mark.parametrize(
     ("starts", "velocities", "found"),
     [
-        ({"a": -0.5, "b": 1.0}, {"a": 0.6}, []),  # 0.36 m to a stand
-        ({"a": 0.5, "b": -0.5}, {"a": 0.6}, ["a: at (0.68, 0.00) m it needs 0.36 m to stand in the geofence"]),
+        ({"a": -0.5, "b": 1.0}, {"a": 0.6}, []),  # 0.54 m to a stand
+        ({"a": 0.5, "b": -0.5}, {"a": 0.6}, ["a: at (0.68, 0.00) m it needs 0.54 m to stand in the geofence"]),
         ({"a": 0.9, "b": -0.5}, {"a": -0.1}, []),  # to the inside
-        ({"a": -0.5, "b": 0.9}, {"a": 0.6, "b": -0.6}, ["a: 1.04 m from b, and 0.32 m where they come to a stand, "]),
+        ({"a": -0.5, "b": 1.26}, {"a": 0.6, "b": -0.6}, ["a: 1.40 m from b, and 0.32 m where they come to a stand, "]),
         ({"a": -0.5, "b": 0.3}, {"a": 0.6, "b": 0.6}, []),  # one behind the other
     ],
 )

@@ -1,6 +1,8 @@
-"""A gate that stops its car: the way of a fake to a stand, rolling and braking."""
+"""The way of a fake to a stand, rolling and braking, by the cause of its stop."""
 
 from __future__ import annotations
+
+from itertools import count
 
 import pytest
 from pydantic import ValidationError
@@ -14,6 +16,7 @@ from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 
 BRAKE = Brake(fields={"z": 620.0}, deceleration=3.0)
 BRAKED = SVEA.model_copy(update={"command": SVEA.command.model_copy(update={"brake": BRAKE})})
+STATION, GATE, AUTOPILOT = Safety().stopping(1.0, SVEA.command)
 FAST = Limits(speed=1.53, steering=0.5, acceleration=2.0, steering_rate=2.0)
 
 
@@ -30,30 +33,50 @@ def way_to_stand(profile: CarProfile, speed: float, cause: str) -> tuple[float, 
         stage.network.publish(profile.topic_of("svea7", Role.MANUAL), payload)
         stage.run(PERIOD * 1e-9)
 
-    for k in range(40):
+    def command(k: int) -> None:
         assert gate.arrive(Role.COMMAND, messages.command(stage.wall + stage.now, "s", k, 0.0, speed)) is None
+
+    for k in range(40):
+        command(k)
         step()
     world, told[:] = stage.cars["svea7"].world, []
     begin, way = stage.now, world.pose(world.agent)[1].copy()
-    if cause == "stop":
-        gate.arrive(Role.STOP, messages.stop(True))
-    while abs(world.twist[0][0]) > 0.02:
-        step()
+    for k in count():
+        if abs(world.twist[0][0]) <= 0.02:
+            break
+        if cause == AUTOPILOT and k < Safety().odometry_age / 0.05:
+            command(40 + k)
+        elif cause in ("stop", AUTOPILOT):
+            gate.arrive(Role.STOP, messages.stop(True))
+        if cause == GATE:
+            stage.run(PERIOD * 1e-9)
+        else:
+            step()
     reached = world.pose(world.agent)[1]
     return (stage.now - begin) * 1e-9, float(((reached - way) ** 2).sum() ** 0.5), told
 
 
 @pytest.mark.parametrize("speed", rest_slow([0.41, 1.0, 1.5], 0, 2))
 def test_a_braked_car_stands_sooner_and_inside_the_margin(speed: float) -> None:
-    for cause in ("silence", "stop"):
+    for cause in (STATION, "stop"):
         rolling, braking = way_to_stand(SVEA, speed, cause), way_to_stand(BRAKED, speed, cause)
-        for (seconds, way, _), brake in ((rolling, None), (braking, BRAKE)):
-            assert way < Safety().stopping(speed, brake)[1] and seconds < Safety().stopping(speed, brake)[0] + 0.35
+        for (seconds, way, _), profile in ((rolling, SVEA), (braking, BRAKED)):
+            after, most = Safety().stopping(speed, profile.command)[STATION if cause == "stop" else cause]
+            assert way < most and seconds < after + 0.35
         assert braking[1] < rolling[1] - speed**2 / 2 * (1.0 - 1.0 / 3.0) * 0.6
         braked = [drive for drive in braking[2] if drive.brake]
         assert abs(len(braked) * 0.05 - speed / 3.0) <= 0.051
         assert braking[2][-1] == NEUTRAL or len(braked) * 0.05 >= speed / 3.0 - 0.051
     assert not any(drive.brake for drive in rolling[2])
+
+
+@pytest.mark.parametrize("speed", rest_slow([1.5, 0.41, 1.0], 0))
+@pytest.mark.parametrize("cause", [GATE, AUTOPILOT])
+def test_a_car_stands_inside_the_margin_of_each_cause(cause: str, speed: float) -> None:
+    ways = Safety().stopping(speed, BRAKED.command)
+    seconds, way, _ = way_to_stand(BRAKED, speed, cause)
+    assert way < ways[cause][1] <= max(most for _, most in ways.values()) == ways[GATE][1]
+    assert seconds < ways[cause][0] + 0.35
 
 
 def test_a_brake_needs_fields_of_the_message() -> None:

@@ -23,7 +23,7 @@ from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
 from coopenv.cars.backend.station import Gates
 from coopenv.cars.codec import MOST_BYTES, encode, make
-from coopenv.cars.deployment import DeploymentError, load_deployment
+from coopenv.cars.deployment import DeploymentError, Safety, load_deployment
 from coopenv.cars.fake.fleet import FakesError, free_port
 from coopenv.cars.fake.fleet import fakes as fake_processes
 from coopenv.cars.gate import write_status
@@ -119,8 +119,10 @@ def test_cars_come_and_go() -> None:
             assert len(mentioning(endpoint)) == 3
             told = health(SHIPPED, endpoint).output.splitlines()
             assert told[0] == "svea7: gate disarmed, 0 commands accepted, 0 messages refused"
-            assert told[1] == "svea7: from 0.5 m/s to a stand 0.8 s and 0.28 m, with safety.deceleration"
-            assert told[2].startswith("svea7: not tried from outside: tcp/127.0.0.1:7447: no Zenoh there")
+            stands = "from 0.5 m/s to a stand 0.8 s and 0.28 m, with safety.deceleration"
+            assert told[1] == f"svea7: station or radio silent: {stands}"
+            assert [line.split(": ")[1] for line in told[1:4]] == [*Safety().stopping(0.5, SVEA.command)]
+            assert told[4].startswith("svea7: not tried from outside: tcp/127.0.0.1:7447: no Zenoh there")
         raise ZeroDivisionError
     assert not mentioning(endpoint)
 

@@ -110,6 +110,10 @@ BAD = {
     "an agent of two": ('[[cars]]\nname = "c"\nagent = 7', "cars: the agent (or marker) 7 is used twice"),
     "a name no topic can have": ('[[cars]]\nname = "a/b"', "cars.3.name: String should match"),
     "two things at once": ('[[cars]]\nname = "c"\nvehicle = "v"\nlandmark = "L"', "cars.3: is a vehicle or a landmark"),
+    "no deceleration": (
+        "[safety]\ndeceleration = 1e-9",
+        "safety.deceleration: Input should be greater than or equal to 0.1",
+    ),
     "too fast": ("[safety]\nmax_speed = 2.0", "safety.max_speed: 2 is over 1.53, the largest of this make"),
     "a channel of two": ("[remote]\nthrottle = 1", "remote: steering, throttle and mode_switch: two of them are on"),
     "no such channel": ("[remote]\nsteering = 0", "remote.steering: Input should be greater than or equal to 1"),
