@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from coopenv.cars.bags.log import TopicRow
-    from coopenv.cars.calibration import Row
+    from coopenv.cars.calibration import Calibrated, Row
 
 
 def import_(
@@ -44,12 +44,13 @@ def import_(
             raise CoopenvError(
                 f"{'--out' if out else '--override'}: needs the map of the bags' topics, --map topics.toml"
             )
-        from coopenv.base.files import check_new, replace_text
+        from coopenv.base.files import check_file, check_new, replace_text
         from coopenv.cars.bags import examined, proposed
         from coopenv.cars.bags.files import BagFile
 
         if propose is not None:
             check_new(propose, force)
+            check_file(propose)
         with ExitStack() as stack:
             files = [stack.enter_context(BagFile(path)) for path in bags]
             rows, notes = examined(files)
@@ -153,12 +154,19 @@ def calibrate(
     files += [save(residual_figure(result, c), out / f"residuals_{car.name}.png") for c, car in enumerate(drive.cars)]
     if as_json:
         options.print_json({name: getattr(result, name) for name in ("rows", "findings", "notes", "noise")})
-        return
+    else:
+        _print_calibrated(result, files)
+    if not result.explained:
+        raise typer.Exit(1)
+
+
+def _print_calibrated(result: Calibrated, files: Sequence[Path]) -> None:
     _print(result.rows)
     console = options.console()
-    if any(car.lens is None for car in drive.cars):
+    if any(car.lens is None for car in result.batch.cars):
         console.print("Bearings without pixels: intrinsics cannot be estimated.")
-    console.print("Measured noise: " + ", ".join(f"{name} = {value:.3g}" for name, value in result.noise.items()))
+    if result.noise:
+        console.print("Measured noise: " + ", ".join(f"{name} = {value:.3g}" for name, value in result.noise.items()))
     for line in (*(result.findings or ("No constant is wrong.",)), *result.notes):
         console.print(line, soft_wrap=True)
     console.print(f"Files: {', '.join(map(str, files))}", soft_wrap=True)

@@ -15,6 +15,13 @@ from coopenv.estimation.poses import Array
 
 FISHEYE = 4
 """Coefficients of a fisheye lens."""
+PLUMB_BOB = ("k1", "k2", "p1", "p2", "k3")
+COEFFICIENTS = {
+    FISHEYE: ("k1", "k2", "k3", "k4"),
+    len(PLUMB_BOB): PLUMB_BOB,
+    8: (*PLUMB_BOB, "k4", "k5", "k6"),
+}
+"""Their names by their number."""
 
 SQUARE = Polynomial([0.0, 1.0])
 """The squared radius."""

@@ -17,13 +17,13 @@ import numpy as np
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning, printable
 from coopenv.cars.backend.assembler import BROADCAST, Assembler
-from coopenv.cars.backend.binding import OPTIONS, bind, reset_options
+from coopenv.cars.backend.binding import OPTIONS, bind, marker_places, reset_options
 from coopenv.cars.bags.clocks import checked
 from coopenv.cars.bags.files import BagFile, check_extra
 from coopenv.cars.bags.log import NS, TopicRow, read_log, regularity
 from coopenv.cars.bags.topic_map import READ, TOPIC, UNNEEDED, TopicMap, load_map
 from coopenv.cars.profile import IMAGES, VELOCITY, Role
-from coopenv.cars.readings import POSES, READERS, Sample, read
+from coopenv.cars.readings import POSES, READERS, CarPose, Sample, read
 from coopenv.cars.vision import Calibration
 from coopenv.scenario import Scenario, load_scenario
 
@@ -31,6 +31,9 @@ AHEAD = 100_000_000
 """ns by which motion capture is read ahead of a tick, so that the truth lies between two of its poses."""
 
 LONGEST_GAP = 600.0  # s without any message that is needed
+
+FAR = 10.0
+"""Times the extent of the landmarks, beyond which motion capture is warned of."""
 
 OFF = 0.1
 """Share by which the rate of a camera may differ from the environment's without a warning."""
@@ -79,7 +82,7 @@ class Bag(TickGenerator):
         self.binding = replace(self.binding, scenario=scenario)
         known = any(sample.role is Role.TRUTH for sample in self.log.samples)
         super().__init__(scenario, Capabilities(known, False, False, ticks, batched=False, recorded=True))
-        for note in (*self.log.notes, *self._odd_rates()):
+        for note in (*self.log.notes, *self._odd_rates(), *self._far_truth()):
             warnings.warn(f"{self.where}: {note}", DataWarning, stacklevel=2)
 
     def _ticks(self) -> tuple[int, int]:
@@ -118,6 +121,17 @@ class Bag(TickGenerator):
             if row.role in (Role.DETECTIONS, Role.BEARINGS) and row.rate and abs(row.rate / self._rate - 1.0) > OFF:
                 hint = f'set overrides = {{ "rates.camera" = {row.rate:.0f}.0 }} in the map'
                 yield f"{row.topic}: {row.rate:.1f} frames per second, the environment has {self._rate:g}: {hint}"
+
+    def _far_truth(self) -> Iterator[str]:
+        """Yield the cars whose median distance from the nearest landmark is far above the extent of all landmarks."""
+        places, hint = marker_places(self.scenario.landmarks)[:, :2], "are its unit (m) and frames.truth right?"
+        width = float(np.linalg.norm(np.ptp(places, axis=0))) if len(places) else 0.0
+        for car in self.binding.cars if width > 0.0 else ():
+            found = [s.value for s in self.log.samples if (s.car, s.role) == (car, Role.TRUTH)]
+            at = np.array([value.position[:2] for value in found if isinstance(value, CarPose)]).reshape(-1, 1, 2)
+            away = float(np.median(np.linalg.norm(at - places, axis=-1).min(axis=-1))) if len(at) else 0.0
+            if away > FAR * width:
+                yield f"motion capture of {car} is {away:.3g} m from landmarks that span {width:.3g} m: {hint}"
 
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
         """Go through the bags tick by tick; the option `arm` has no effect."""

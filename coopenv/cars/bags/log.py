@@ -26,7 +26,7 @@ from coopenv.base.errors import CoopenvError, DataError, DataWarning, listed
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.bags.clocks import Delay, Leads, checked, jumps, leads_of, moves_of
 from coopenv.cars.bags.files import BagFile
-from coopenv.cars.bags.topic_map import TRUTH, Chosen, MapFrame, TopicMap, select
+from coopenv.cars.bags.topic_map import TRUTH, Chosen, ClockSettings, Correction, MapFrame, TopicMap, select
 from coopenv.cars.codec import encode, stamp_of
 from coopenv.cars.gate import read_drive
 from coopenv.cars.profile import Role
@@ -105,6 +105,7 @@ def value_reader(
         calibrations: of the cars' cameras.
     """
     known, turning = frozenset(binding.targets), {entry.car for entry in chosen if entry.role is Role.IMU}
+    right = Correction()
     frames = {Role.TRUTH: given.frames.truth or given.frames.map}
 
     def read_value(entry: Chosen, message: Any) -> Value:
@@ -114,8 +115,10 @@ def value_reader(
         value = read(entry.role, message, calibration, distorted=given.distorted, known=known, vision=given.vision)
         if isinstance(value, CarPose):
             return in_frame(value, frames.get(entry.role, given.frames.map))
-        if isinstance(value, Twist) and entry.role is Role.WHEEL and entry.car in turning:
-            return Twist(value.linear, None)  # the IMU knows better
+        if isinstance(value, Twist):
+            value = given.corrections.get(entry.car, right).twist(value)
+            if entry.role is Role.WHEEL and entry.car in turning:
+                return Twist(value.linear, None)  # the IMU knows better
         return value
 
     return read_value
@@ -205,8 +208,10 @@ class Track:
 APART = NS  # ns between the delays of two topics of a car beyond which they have different clocks
 
 
-def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: ReadValue, mode: str) -> list[Track]:
-    """Return what a file of that number has on the chosen topics; `mode` of the map's clocks."""
+def tracks_of(
+    number: int, file: BagFile, chosen: Collection[Chosen], value: ReadValue, clocks: ClockSettings
+) -> list[Track]:
+    """Return what a file of that number has on the chosen topics."""
     wanted = [entry for entry in chosen if entry.role is not Role.CAMERA_INFO and entry.topic in file.topics]
     tracks = {entry.topic: Track(number, entry) for entry in sorted(wanted, key=lambda entry: entry.topic)}
     for topic, received, decode in file.messages(tracks):
@@ -214,15 +219,17 @@ def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: Rea
         entry = track.chosen
         try:
             message = decode()
-            stamp, found = 0 if mode == "received" else stamp_of(message), value(entry, message)
-            stamp += found.late if stamp and isinstance(found, Detections) else 0
+            stamp, found = 0 if clocks.mode == "received" else stamp_of(message), value(entry, message)
+            if stamp:
+                late = found.late if isinstance(found, Detections) else 0
+                stamp += late + round(clocks.leads.get(topic, 0.0) * NS)
             track.entries.append(Sample(entry.car, entry.sample_role, stamp, received, found))
         except CoopenvError as error:
             track.refused[str(error)] += 1
         except (AttributeError, TypeError, ValueError) as error:  # a definition with other fields than ours
             track.refused[f"{file.topics[topic]} has other fields than expected ({error})"] += 1
     for track in tracks.values():
-        track.clean_stamps(mode)
+        track.clean_stamps(clocks.mode)
     return list(tracks.values())
 
 
@@ -340,11 +347,13 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         if given.vision.rectified:
             lenses = {name: replace(lens, distortion=(0.0,) * 5) for name, lens in lenses.items()}
         lenses |= _published(files, chosen, given)  # a calibration that a car publishes replaces the environment's
+        lenses |= {car: made.lens(lenses[car]) for car, made in given.corrections.items() if car in lenses}
         value, mode = value_reader(given, binding, chosen, lenses), given.clocks.mode
-        tracks = [track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, mode)]
-    if odd := [name for name in given.clocks.offsets if name[0] == "/" and name not in {e.topic for e in chosen}]:
-        known = listed(sorted(entry.topic for entry in chosen))
-        raise DataError(f"{given.path.name}: clocks.offsets: {odd[0]} is none of the topics that are read: {known}")
+        tracks = [track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, given.clocks)]
+    known = sorted(entry.topic for entry in chosen)
+    for key in ("offsets", "leads"):
+        if odd := [name for name in getattr(given.clocks, key) if name[0] == "/" and name not in known]:
+            raise DataError(f"{given.path.name}: clocks.{key}: {odd[0]} is none of the topics read: {listed(known)}")
     for entry in chosen:
         _check(entry, [track for track in tracks if track.chosen is entry], where)
     tolerance = given.clocks.tolerance * NS if mode == "auto" else float("inf")
@@ -376,8 +385,8 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     }
     for track in tracks:
         shift, topic = clocks.shifts.get(track.source), track.chosen.topic
-        moved = moves.get(topic, 0) + (shift.added if shift else 0)
-        added.setdefault((track.chosen.car, track.chosen.role), (topic, moved / NS))
+        moved = (moves.get(topic, 0) + (shift.added if shift else 0)) / NS + given.clocks.leads.get(topic, 0.0)
+        added.setdefault((track.chosen.car, track.chosen.role), (topic, moved))
     return BagLog(samples, rows_of(files, chosen, samples, clocks, tracks, leads), tuple(notes), pixels, added, sent)
 
 

@@ -1,15 +1,17 @@
 """The map of a bag: the environment of its cars, their topics, and the treatment of its clocks."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+import numpy as np
+from pydantic import Field, field_validator, model_validator
 
-from coopenv.base.errors import CoopenvError, DataError, listed, suggest
-from coopenv.base.sections import Section, read_toml, validated, with_tables
+from coopenv.base.errors import CoopenvError, DataError, check_one_of, listed, suggest
+from coopenv.base.sections import PositiveVector2, Section, Vector2, read_toml, validated, with_tables
 from coopenv.cars.deployment import Car, Marker, Name, refuse_repeated
 from coopenv.cars.profile import (
     AUTHORS,
@@ -23,7 +25,9 @@ from coopenv.cars.profile import (
     VisionSettings,
     load_profile,
 )
-from coopenv.cars.readings import READERS
+from coopenv.cars.readings import READERS, Twist
+from coopenv.cars.vision import Calibration
+from coopenv.estimation.lens import COEFFICIENTS
 
 PATTERNS: dict[str, dict[Role, tuple[str, ...]]] = {
     "authors": {role: tuple(f"/{name}" for name in names) for role, names in AUTHORS.items()},
@@ -109,6 +113,39 @@ class BagCar(Car):
         return {"car": self.name, "agent": agent, "body": self.body or self.name}
 
 
+class Correction(Section):
+    """Constants of a car, as `coopenv calibrate` finds them."""
+
+    focal_length: PositiveVector2 | None = None
+    """Of its camera, instead of that of CameraInfo, px."""
+    principal_point: Vector2 | None = None
+    """Of its camera, px."""
+    distortion: tuple[Number, ...] | None = None
+    """Of its camera: 5 coefficients, 8, or 4 of a fisheye."""
+    wheel_scale: float = Field(default=0.0, gt=-1.0, le=10.0)
+    """Relative error of its speeds, removed."""
+    gyro_bias: Number = 0.0
+    """Error of its turn rates, removed, rad/s."""
+
+    @field_validator("distortion")
+    @classmethod
+    def _is_of_a_model(cls, given: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if given is not None and len(given) not in COEFFICIENTS:
+            raise ValueError(f"has {len(given)} coefficients, a model has 4, 5 or 8")
+        return given
+
+    def lens(self, lens: Calibration) -> Calibration:
+        """Return a camera's intrinsics with those that are given here."""
+        names = ("focal_length", "principal_point", "distortion")
+        return replace(lens, **{name: value for name in names if (value := getattr(self, name)) is not None})
+
+    def twist(self, twist: Twist) -> Twist:
+        """Return a measured twist without its errors."""
+        v, w = twist.linear, twist.angular
+        bias = np.array([0.0, 0.0, self.gyro_bias])
+        return Twist(None if v is None else v / (1.0 + self.wheel_scale), None if w is None else w - bias)
+
+
 class ClockSettings(Section):
     """How times are read."""
 
@@ -119,6 +156,11 @@ class ClockSettings(Section):
     """Offset of a clock above which its stamps are shifted, s."""
     offsets: dict[str, Number] = Field(default={}, max_length=64)
     """Time added to the stamps of a car, of `truth`, or of a topic, instead of the estimated offset, s."""
+    leads: dict[TopicName, Number] = Field(default={}, max_length=64)
+    """By how much the stamps of a topic are too early in every drive, s: added before offsets are estimated."""
+
+
+TURN = round(2.0 * math.pi, 4)  # rad
 
 
 class MapFrame(Section):
@@ -126,7 +168,7 @@ class MapFrame(Section):
 
     position: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
     """Origin of the frame in the environment's coordinates, m."""
-    yaw: Number = 0.0
+    yaw: float = Field(default=0.0, ge=-TURN, le=TURN)
     """Rotation of the frame to the left, rad."""
 
 
@@ -147,8 +189,10 @@ class TopicMap(Section):
     overrides: dict[str, Any] = Field(default={})
     """Dotted keys of the environment with other values."""
     calibration: str | None = None
-    """File that `coopenv calibrate` has written (relative to this file): its overrides and clock offsets replace those
-    of this file."""
+    """File that `coopenv calibrate` has written (relative to this file): its overrides, leads of clocks and corrections
+    replace those of this file."""
+    corrections: dict[Name, Correction] = Field(default={})
+    """Constants by the name of a car, instead of those that it publishes."""
     names: str = "svea"
     """Scheme of topic names, unless `cars.topics` gives others: `authors`, `none`, or a profile as in a deployment
     file, `svea` or a TOML file (relative to this file)."""
@@ -182,6 +226,8 @@ class TopicMap(Section):
         for name in self.clocks.offsets:
             if name not in known and not name.startswith("/"):
                 raise ValueError(f"clocks.offsets: {name!r} is none of {', '.join(sorted(known))}, or a topic")
+        for name in self.corrections:
+            check_one_of("corrections: unknown car", name, sorted(known - {"truth"}), ValueError)
         return self
 
     @property
@@ -189,6 +235,15 @@ class TopicMap(Section):
         """The environment as `load_scenario` takes it."""
         beside = self.path.parent / self.environment
         return str(beside) if self.environment.endswith(".toml") else self.environment
+
+
+class CalibrationFile(Section):
+    """What `coopenv calibrate` writes."""
+
+    overrides: dict[str, Any]
+    clocks: ClockSettings
+    corrections: dict[Name, Correction] = Field(default={})
+    constants: dict[str, Any]
 
 
 def load_map(path: str | Path) -> TopicMap:
@@ -202,9 +257,10 @@ def load_map(path: str | Path) -> TopicMap:
     if isinstance(name := data.get("calibration"), str):
         found = read_toml(path.parent / name, TopicMapError)
         both = f"{path.name} and {name}"
-        own, more = (with_tables({}, file, ("clocks",), both, TopicMapError)["clocks"] for file in (data, found))
-        data = with_tables(data, found, ("overrides",), both, TopicMapError)
-        data["clocks"] = with_tables(own, more, ("offsets",), f"{both}: clocks", TopicMapError)
+        validated(CalibrationFile, json.dumps(found, default=str), f"{path.name}: calibration: {name}", TopicMapError)
+        own = with_tables(data, {}, ("clocks",), path.name, TopicMapError)["clocks"]
+        data = with_tables(data, found, ("overrides", "corrections"), both, TopicMapError)
+        data["clocks"] = with_tables(own, found["clocks"], ("leads",), f"{both}: clocks", TopicMapError)
     made = validated(TopicMap, json.dumps(data, default=str), path.name, TopicMapError)
     try:
         make = SVEA if made.names in PATTERNS else load_profile(made.names, path.parent)
@@ -259,7 +315,12 @@ def select(given: TopicMap, topics: Mapping[str, str], where: str) -> list[Chose
     Raises:
         DataError: a needed topic is absent, or holds messages that cannot be read in the role of the map.
     """
-    return [chosen for car in given.cars for chosen in _of_car(given, car, topics, where)]
+    found: dict[str, Chosen] = {}
+    for entry in (entry for car in given.cars for entry in _of_car(given, car, topics, where)):
+        if (other := found.setdefault(entry.topic, entry)) is not entry:
+            both = f"cars.{other.car}.topics.{other.role} and cars.{entry.car}.topics.{entry.role}"
+            raise DataError(f"{given.path.name}: {both} are one topic, {entry.topic}")
+    return [*found.values()]
 
 
 def _of_car(given: TopicMap, car: BagCar, topics: Mapping[str, str], where: str) -> list[Chosen]:

@@ -14,13 +14,13 @@ from math import log
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
-from coopenv.base.errors import DataError
+from coopenv.base.errors import DataError, listed
 from coopenv.cars.calibration.batch import (
     BIAS,
     CAMERA_TIME,
-    LENS,
     LEVER,
     ROT,
     SCALE,
@@ -31,7 +31,8 @@ from coopenv.cars.calibration.batch import (
     standard_errors,
     stated_rate,
 )
-from coopenv.cars.calibration.drives import Drive
+from coopenv.cars.calibration.drives import CarDrive, Drive
+from coopenv.estimation.lens import PLUMB_BOB
 from coopenv.estimation.poses import Array, Mask
 
 TRIED = 7  # hypotheses that are fitted in each round
@@ -44,6 +45,9 @@ FINEST = {"deg": 0.0035, "m": 0.004, "px": 1.0, "": 0.01, "rad/s": 0.002, "s": 0
 
 LARGEST_PIXEL, LARGEST_ANGLE, LARGEST_PLACE = 4.0, 0.02, 0.1
 """Standard deviations of residuals (pixels; rad without pixels; m of motion capture) above which nothing fits."""
+UNITS = {"deg/s": 57.3, "km/h": 3.6, "mm/s": 1000.0}
+"""Factors of units that are not those of messages."""
+WITHIN = "within the environment's noise"
 TIGHT = {"marker": 0.01, "truth.frame": 0.01}
 """By the begin of a name, the prior (m, rad) in the estimate of all constants together: the map is surveyed."""
 
@@ -57,7 +61,7 @@ class Row:
     given: float
     value: float
     error: float  # standard
-    finding: str  # "wrong", "not determined by this drive" or nothing
+    finding: str  # "wrong", "not determined by this drive", `WITHIN` or nothing
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,8 @@ class Calibrated:
     rows: tuple[Row, ...]
     findings: tuple[str, ...]  # a line per finding
     notes: tuple[str, ...]  # which stamps import has moved
-    noise: dict[str, float]  # measured, by key of an environment
+    noise: dict[str, float]  # measured, by key of an environment; none where residuals are not explained
+    explained: bool = True  # whether constants explain the residuals
 
 
 INTRINSICS = ("focal length", "principal point", "lens distortion")
@@ -143,7 +148,7 @@ def _calibrated(batch: Batch) -> Calibrated:
             break
         fit = tried[best]
     error = errors(batch, fit)
-    kept = given.free | wrong(batch, fit, error)
+    kept = given.free | wrong(batch, fit, error)[0]
     for title, part in parts_of(batch).items():  # coefficients of a lens are right or wrong together
         if title.endswith(INTRINSICS):
             kept[part] = kept[part].any()
@@ -177,15 +182,15 @@ def errors(batch: Batch, fit: Fit) -> Array:
     return error
 
 
-def wrong(batch: Batch, fit: Fit, error: Array) -> Mask:
-    """Return which constants are wrong; wheel scale and gyro bias beyond what the environment expects."""
+def wrong(batch: Batch, fit: Fit, error: Array) -> tuple[Mask, Mask]:
+    """Return which constants are wrong, and which are off, yet within the noise by which the environment draws them."""
     finest = np.array([FINEST[kind.unit] for kind in batch.kinds])
+    off, drawn = fit.free & (np.abs(fit.x) > np.maximum(SIGNIFICANT * error, finest)), np.zeros(len(finest))
     for c, car in enumerate(batch.cars):
         noise = batch.drive.scenario.noises[car.vehicle]
-        own = finest[batch.own(c)]
-        own[SCALE] = max(own[SCALE], SIGNIFICANT * noise.odometry_scale)
-        own[BIAS] = max(own[BIAS], SIGNIFICANT * float(np.max(noise.gyro_bias)))
-    return np.asarray(fit.free & (np.abs(fit.x) > np.maximum(SIGNIFICANT * error, finest)))
+        drawn[batch.own(c).start + np.array([SCALE, BIAS])] = noise.odometry_scale, float(np.max(noise.gyro_bias))
+    expected = np.abs(fit.x) <= SIGNIFICANT * drawn
+    return off & ~expected, off & expected
 
 
 def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]) -> Calibrated:
@@ -193,7 +198,7 @@ def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]
     unexplained = list(_unexplained(batch, fit))
     fit = given if unexplained else fit
     error, wide = errors(batch, fit), batch.prior
-    bad = wrong(batch, fit, error) & (not unexplained)
+    bad, within = (found & (not unexplained) for found in wrong(batch, fit, error))
     tight = [next((std for begin, std in TIGHT.items() if kind.name.startswith(begin)), np.inf) for kind in batch.kinds]
     batch.prior = np.where(fit.free, wide, np.minimum(tight, wide))
     whole = batch.fit(replace(fit, free=batch.known))
@@ -203,7 +208,8 @@ def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]
     rows = {}
     for n in np.flatnonzero(batch.known):
         kind, factor = batch.kinds[n], np.degrees(1.0) if batch.kinds[n].unit == "deg" else 1.0
-        finding = "wrong" if bad[n] else "not determined by this drive" if loose[n] else ""
+        judged = ((bad, "wrong"), (loose, "not determined by this drive"), (within, WITHIN))
+        finding = next((words for found, words in judged if found[n]), "")
         old, value, std = (factor * float(v) for v in (batch.base[n], batch.base[n] + x[n], error[n]))
         rows[int(n)] = Row(kind.name, kind.unit, old, value, std, finding)
     names = batch.drive.landmarks
@@ -218,7 +224,8 @@ def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]
         late = batch.own(c).start + np.array([CAMERA_TIME, TRUTH_TIME])
         if bad[late].all() and abs(np.diff(x[late])[0]) < SIGNIFICANT * np.hypot(*error[late]):
             lines.append(f"{car.name}: camera and motion capture agree, so that the stamps of wheels and IMU are wrong")
-    return Calibrated(batch, given, fit, tuple(rows.values()), tuple(lines), notes, _noise(batch, fit))
+    noise = {} if unexplained else _noise(batch, fit)
+    return Calibrated(batch, given, fit, tuple(rows.values()), tuple(lines), notes, noise, not unexplained)
 
 
 def _unexplained(batch: Batch, fit: Fit) -> Iterator[str]:
@@ -227,7 +234,24 @@ def _unexplained(batch: Batch, fit: Fit) -> Iterator[str]:
         unit, most = ("rad", LARGEST_ANGLE) if car.lens is None else ("px", LARGEST_PIXEL)
         if seen > most or (truth and place > LARGEST_PLACE):
             off = f"{seen:.3g} {unit}" + (f" and {place:.3g} m of motion capture" if truth else "")
-            yield f"{car.name}: no constant explains the residuals ({off}): check landmarks, markers, frames and clocks"
+            check = listed([*_odd_units(car)]) or "check landmarks, markers, frames and clocks"
+            yield f"{car.name}: no constant explains the residuals ({off}): {check}"
+
+
+def _odd_units(car: CarDrive) -> Iterator[str]:
+    """Yield measured rates whose unit is not that of motion capture, and by what factor."""
+    if len(car.truth_time) < 2:
+        return
+    time = np.arange(car.truth_time[0], car.truth_time[-1], 0.5)
+    place, yaw = (np.interp(time, car.truth_time, v) for v in (car.truth, np.unwrap(car.truth_yaw)))
+    tracks = ("turn rates", car.gyro_time, car.gyro, yaw), ("speeds", car.wheel_time, np.abs(car.wheel), place)
+    for name, when, rate, true in tracks:
+        way = np.diff(np.interp(time, when, cumulative_trapezoid(rate, when, initial=0.0)))
+        step = np.diff(true) if name == "turn rates" else np.abs(np.diff(true))
+        factor = float(way @ step / max(float(step @ step), 1e-9))
+        if not 0.5 < factor < 2.0:
+            unit = next((f" ({unit}?)" for unit, k in UNITS.items() if abs(factor / k - 1.0) < 0.1), "")
+            yield f"its {name} are {factor:.3g} times those of motion capture{unit}"
 
 
 def _noise(batch: Batch, fit: Fit) -> dict[str, float]:
@@ -241,18 +265,22 @@ def _noise(batch: Batch, fit: Fit) -> dict[str, float]:
     }
 
 
-def overrides(result: Calibrated) -> dict[str, float | list[float]]:
-    """Return dotted keys of the environment with the calibrated cameras, landmarks and noise."""
-    batch, found = result.batch, dict[str, float | list[float]]()
+Constants = dict[str, float | list[float]]
+
+
+def overrides(result: Calibrated) -> Constants:
+    """Return dotted keys of the environment with the calibrated cameras, landmarks and noise; none without result."""
+    batch, found = result.batch, Constants()
+    if not result.explained:
+        return found
     value = batch.base + result.fit.x
     for c, car in enumerate(batch.cars):
         key, own = f"vehicles.{car.vehicle}.camera.", value[batch.own(c)]
         quaternion = Rotation.from_matrix(Rotation.from_rotvec(own[ROT]).as_matrix() @ car.mounting).as_quat()
         found[key + "orientation"] = quaternion[[3, 0, 1, 2]].tolist()
         found[key + "position"] = own[LEVER].tolist()
-        if car.lens is not None:
-            fx, fy, cx, cy, *bent = own[LENS].tolist()
-            found |= {key + "focal_length": [fx, fy], key + "principal_point": [cx, cy], key + "distortion": bent}
+        if car.lens is not None and len(car.lens.distortion) == len(PLUMB_BOB):  # the model of the environment
+            found |= {key + name: numbers for name, numbers in intrinsics(batch, c, value).items()}
     moved = batch.places + result.fit.x[batch.markers : batch.frame].reshape(-1, 3) - batch.drive.places
     for mark in batch.drive.scenario.landmarks:
         if mark.name in batch.drive.landmarks and (step := moved[batch.drive.landmarks.index(mark.name)]).any():
@@ -260,15 +288,29 @@ def overrides(result: Calibrated) -> dict[str, float | list[float]]:
     return {name: np.round(values, 7).tolist() for name, values in (found | result.noise).items()}
 
 
+def intrinsics(batch: Batch, c: int, value: Array) -> Constants:
+    """Return the intrinsics of the camera of a car by values of all constants."""
+    fx, fy, cx, cy, *bent = value[batch.lens(c)].tolist()
+    return {"focal_length": [fx, fy], "principal_point": [cx, cy], "distortion": bent}
+
+
 def toml_text(result: Calibrated) -> str:
-    """Return overrides, clock offsets and all constants with their standard errors as TOML."""
-    offsets: dict[str, float] = {}
-    for c, car in enumerate(result.batch.cars):
-        values = (result.batch.base + result.fit.x)[result.batch.own(c)][CAMERA_TIME : TRUTH_TIME + 1]
-        pairs = zip(car.topics, values, strict=True)
-        offsets |= {topic: round(float(value), 5) for (topic, _), value in pairs if topic and value}
-    first = "Written by coopenv calibrate. Key `calibration` of a bag's map uses [overrides] and [clocks]."
-    return tables_text(first, {"overrides": overrides(result), "clocks.offsets": offsets}, result.rows)
+    """Return overrides, leads of topics, corrections and all constants with their standard errors as TOML.
+
+    A lead is against the turn rates of the same car: offsets of a car's clock and of motion capture are of one drive.
+    """
+    batch, leads, tables = result.batch, dict[str, float](), dict[str, Mapping[str, object]]()
+    value = batch.base + result.fit.x
+    for c, car in enumerate(batch.cars if result.explained else ()):
+        own = value[batch.own(c)]
+        pairs = zip(car.topics[:2], own[[CAMERA_TIME, WHEEL_TIME]], strict=True)
+        leads |= {topic: round(float(late), 5) for (topic, _), late in pairs if topic and abs(late) > FINEST["s"]}
+        if car.topics[0][0]:  # of a bag
+            found: Constants = {"wheel_scale": float(own[SCALE]), "gyro_bias": float(own[BIAS])}
+            found |= {} if car.lens is None else intrinsics(batch, c, value)
+            tables[f"corrections.{car.name}"] = {name: np.round(v, 7).tolist() for name, v in found.items()}
+    first = "Written by coopenv calibrate, for the key `calibration` of a bag's map."
+    return tables_text(first, {"overrides": overrides(result), "clocks.leads": leads, **tables}, result.rows)
 
 
 def tables_text(first: str, tables: Mapping[str, Mapping[str, object]], rows: Sequence[Row]) -> str:

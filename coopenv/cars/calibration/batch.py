@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import DataError
 from coopenv.cars.calibration.drives import CarDrive, Drive, averaged
-from coopenv.estimation.lens import distort, largest_radius
+from coopenv.estimation.lens import COEFFICIENTS, distort, largest_radius
 from coopenv.estimation.poses import Array, Mask, skew
 from coopenv.scenario import Scenario
 
@@ -61,9 +61,7 @@ PER_CAR = (
     *(Kind(f"camera.{name}", "m", 0.3, 1e-6, "camera position") for name in "xyz"),
     *(Kind(f"camera.{name}", "px", 40.0, 1e-4, "focal length") for name in ("fx", "fy")),
     *(Kind(f"camera.{name}", "px", 40.0, 1e-4, "principal point") for name in ("cx", "cy")),
-    *(Kind(f"camera.{name}", "", 0.5, 1e-7, "lens distortion") for name in ("k1", "k2")),
-    *(Kind(f"camera.{name}", "", 0.02, 1e-7, "lens distortion") for name in ("p1", "p2")),
-    Kind("camera.k3", "", 0.2, 1e-7, "lens distortion"),
+    *(Kind("camera.", "", 0.0, 1e-7, "lens distortion") for _ in range(max(COEFFICIENTS))),  # by the model of the lens
     Kind("wheel.scale", "", 0.15, 1e-7, "wheel scale"),
     Kind("gyro.bias", "rad/s", 0.1, 1e-7, "gyro bias"),
     Kind("camera.offset", "s", 0.5, 1e-5, "stamps"),
@@ -77,8 +75,10 @@ FRAME = (
     Kind("truth.frame_yaw", "deg", 0.2, 1e-6, "frame of motion capture"),
     *(Kind(f"truth.frame_{axis}", "m", 0.3, 1e-6, "frame of motion capture") for axis in "xy"),
 )
-ROT, LEVER, LENS, SCALE, BIAS = slice(0, 3), slice(3, 6), slice(6, 15), 15, 16
-CAMERA_TIME, WHEEL_TIME, TRUTH_TIME, BODY = 17, 18, 19, slice(20, 23)
+BENT = {"k1": 0.5, "k2": 0.5, "p1": 0.02, "p2": 0.02}
+"""Priors of coefficients; those of others are 0.2."""
+ROT, LEVER, LENS, SCALE, BIAS = slice(0, 3), slice(3, 6), slice(6, 18), 18, 19
+CAMERA_TIME, WHEEL_TIME, TRUTH_TIME, BODY = 20, 21, 22, slice(23, 26)
 NUISANCE = (SCALE, BIAS)
 """Constants that every drive has anew."""
 
@@ -138,12 +138,18 @@ class Batch:
         ]
         self.markers = len(PER_CAR) * len(self.cars)
         self.frame = len(self.kinds) - len(FRAME)
-        self.prior = np.array([kind.prior for kind in self.kinds])
+        for c, car in enumerate(self.cars):
+            names = () if car.lens is None else COEFFICIENTS[len(car.lens.distortion)]
+            for n, name in zip(self.lens(c)[4:], names, strict=True):
+                kind = self.kinds[n]
+                self.kinds[n] = kind._replace(name=kind.name + name, prior=BENT.get(name, 0.2))
+        self.prior = np.array([kind.prior or 1.0 for kind in self.kinds])
         self.steps = np.array([kind.step for kind in self.kinds])
         self.known = np.ones(len(self.kinds), dtype=bool)
         for c, car in enumerate(self.cars):
             mine = self.known[self.own(c)]
-            mine[LENS] = car.lens is not None
+            mine[LENS] = False
+            self.known[self.lens(c)] = car.lens is not None
             mine[WHEEL_TIME] = not np.array_equal(car.wheel_time, car.gyro_time)
             mine[TRUTH_TIME] = mine[BODY] = self.truth[c]
         self.known[self.frame :] = any(self.truth)
@@ -163,9 +169,10 @@ class Batch:
         self.base = np.zeros(len(self.kinds))  # given values
         for c, car in enumerate(self.cars):
             mine = self.base[self.own(c)]
-            mine[LEVER], mine[CAMERA_TIME : TRUTH_TIME + 1] = car.lever, [added for _, added in car.topics]
+            mine[LEVER], mine[[SCALE, BIAS]] = car.lever, car.corrected
+            mine[CAMERA_TIME : TRUTH_TIME + 1] = [added - car.gyro_added for _, added in car.topics]
             if (lens := car.lens) is not None:
-                mine[LENS] = *lens.focal_length, *lens.principal_point, *lens.distortion
+                self.base[self.lens(c)] = *lens.focal_length, *lens.principal_point, *lens.distortion
         self.base[self.markers : self.frame] = self.places.ravel()
         self.slow = [averaged(car.wheel, float(np.median(np.diff(car.wheel_time)))) for car in self.cars]
         self.paths: dict[int, tuple[tuple[float, ...], Path]] = {}  # the last one of each car, with its constants
@@ -173,6 +180,11 @@ class Batch:
     def own(self, c: int) -> slice:
         """Return where the constants of a car are."""
         return slice(c * len(PER_CAR), (c + 1) * len(PER_CAR))
+
+    def lens(self, c: int) -> NDArray[np.int64]:
+        """Return where the constants of the lens of a car are."""
+        lens, begin = self.cars[c].lens, self.own(c).start + LENS.start
+        return np.arange(begin, begin + 4 + (0 if lens is None else len(lens.distortion)))
 
     def marker(self, i: int) -> slice:
         """Return where the coordinates of a marker are."""
@@ -190,7 +202,7 @@ class Batch:
         if own[WHEEL_TIME]:
             speed += np.interp(time, car.wheel_time + own[WHEEL_TIME], self.slow[c])
             speed -= np.interp(time, car.wheel_time, self.slow[c])
-        speed /= 1.0 + own[SCALE]
+        speed /= 1.0 + own[SCALE] / (1.0 + car.corrected[0])
         yaw = cumulative_trapezoid(rate, dx=GRID, initial=0.0)
         place = cumulative_trapezoid(speed * np.exp(1j * yaw), dx=GRID, initial=0.0)
         self.paths[c] = given, Path(time, yaw, place, averaged(rate, GRID), averaged(speed, GRID))
@@ -243,9 +255,10 @@ class Batch:
             return np.stack([off[0] + far, off[1] + far], axis=-1)
         lens, change = car.lens, own[LENS]
         flat = ray[:, :2] / np.maximum(ray[:, 2:], 0.05)
-        bent = tuple((np.array(lens.distortion) + change[4:]).tolist())
+        bent = tuple((np.array(lens.distortion) + change[4 : 4 + len(lens.distortion)]).tolist())
         radius = np.linalg.norm(flat, axis=-1, keepdims=True)
-        flat = flat * np.minimum(1.0, min(largest_radius(bent), 2.0) / np.maximum(radius, 1e-9))
+        most = max(2.0, 1.2 * float((np.linalg.norm(car.ray[:, :2], axis=-1) / car.ray[:, 2]).max()))
+        flat = flat * np.minimum(1.0, min(largest_radius(bent), most) / np.maximum(radius, 1e-9))
         return np.asarray(
             car.pixel
             - distort(flat, bent) * (np.array(lens.focal_length) + change[:2])

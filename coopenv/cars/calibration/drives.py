@@ -11,6 +11,7 @@ from scipy.ndimage import uniform_filter1d
 
 from coopenv.base.errors import DataError
 from coopenv.cars.backend.binding import marker_places
+from coopenv.cars.bags.topic_map import Correction
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import sightings_of, tracks_of, yaw_of
 from coopenv.cars.vision import Calibration, rays
@@ -28,8 +29,11 @@ STEP, TURNING, SMOOTH = 0.002, 0.2, 0.5
 """Motion (m) that makes a further sighting of a landmark count, m of it per rad, and s over which it is averaged."""
 CLIMB, TILT = 0.05, 0.1
 """Mean vertical velocity, m/s, and mean rate of roll and pitch, rad/s, above which a vehicle is no car."""
-ROLES = ((Role.DETECTIONS, Role.BEARINGS), (Role.WHEEL, Role.ODOMETRY), (Role.TRUTH,))
-"""Of the topics of camera, wheels and motion capture."""
+ROLES = (
+    *((Role.DETECTIONS, Role.BEARINGS), (Role.WHEEL, Role.ODOMETRY), (Role.TRUTH,)),
+    (Role.IMU, Role.ODOMETRY, Role.WHEEL),
+)
+"""Of the topics of camera, wheels, motion capture and turn rates."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +59,8 @@ class CarDrive:
     height: float  # m, of the body's origin
     topics: tuple[tuple[str, float], ...] = (("", 0.0),) * 3
     """Topics of camera, wheels and motion capture, and s that were added to their stamps."""
+    gyro_added: float = 0.0  # s that were added to the stamps of turn rates, against which all offsets count
+    corrected: tuple[float, float] = (0.0, 0.0)  # wheel scale and gyro bias (rad/s) that are removed already
 
 
 @dataclass(frozen=True)
@@ -122,12 +128,12 @@ def drive_of_bag(bag: "Bag") -> Drive:
 def _of_samples(bag: "Bag", name: str, vehicle: int, number: dict[int, int]) -> CarDrive:
     samples, added = [s for s in bag.log.samples if s.car == name], bag.log.added
     time, target, ray = sightings_of(samples, samples[0].stamp, number)
-    topics = (next((added[name, role] for role in roles if (name, role) in added), ("", 0.0)) for roles in ROLES)
+    topics = [next((added[name, role] for role in roles if (name, role) in added), ("", 0.0)) for roles in ROLES]
+    right = bag.map.corrections.get(name, Correction())
     tracks = {key: value for key, value in tracks_of(samples, samples[0].stamp).items() if "command" not in key}
-    found = {"time": time, "target": target, "topics": tuple(topics), **tracks}
-    lens = bag.log.lenses.get(name)
-    lens = lens if lens and len(lens.distortion) == 5 else None  # only that model's coefficients are estimated
-    return car_of(bag.scenario, name, vehicle, lens, ray, bag.where, **found)
+    found = {"time": time, "target": target, "topics": tuple(topics[:3]), "gyro_added": topics[3][1], **tracks}
+    found["corrected"] = (right.wheel_scale, right.gyro_bias)
+    return car_of(bag.scenario, name, vehicle, bag.log.lenses.get(name), ray, bag.where, **found)
 
 
 def drive_of_recording(recording: "Recording", path: Path) -> Drive:

@@ -22,10 +22,12 @@ from coopenv.backends.mcap import container
 from coopenv.backends.mcap.format import metadata_names
 from coopenv.backends.sources import SourceKind, is_bag, kind_of
 from coopenv.base.errors import DataWarning
+from coopenv.cars import codec
 from coopenv.cars.bags import Bag, files
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TopicMapError, load_map
-from coopenv.cars.readings import Detections
+from coopenv.cars.profile import Role
+from coopenv.cars.readings import Detections, Twist
 from coopenv.cli import main
 from coopenv.scenario import load_scenario
 from tests.helpers import bags
@@ -204,6 +206,13 @@ MISTAKES: list[tuple[Callable[[str], str], str]] = [
     (lambda t: t.replace('"crossing_path"', '"crossing_pth"'), "did you mean 'crossing_path'"),
     (lambda t: t.replace('"crossing_path"', '"there.toml"'), "there.toml"),
     (lambda t: t + "[clocks]\noffsets = { svea2 = 1.0 }\n", "clocks.offsets: 'svea2' is none of svea1, svea3, truth"),
+    (lambda t: t + "[frames]\nmap = { yaw = 90.0 }\n", r"frames\.map\.yaw: .* less than or equal to 6\.28.*, got 90"),
+    (lambda t: t + "[corrections.svea2]\ngyro_bias = 0.1\n", "corrections: unknown car 'svea2'.*; known: svea1, svea3"),
+    (lambda t: t + "[corrections.svea3]\ndistortion = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]\n",
+     r"corrections\.svea3\.distortion: has 6 coefficients, a model has 4, 5 or 8"),
+    (lambda t: t + '[cars.topics]\nestimate = "/qualisys/svea3/pose"\n',
+     r"topics\.toml: cars\.svea3\.topics\.truth and cars\.svea1\.topics\.estimate are one topic, /qualisys/svea3/pose"),
+    (lambda t: 'calibration = "topics.toml"\n' + t, r"topics\.toml: calibration: topics\.toml: .*unknown key"),
     (lambda t: 'start = 99.0\n' + t, "too few for two ticks"),
     (lambda t: t + "[", "not valid TOML"),
     (lambda t: t.replace("[overrides]", '[overrides]\n"noise.enabld" = true'), "did you mean 'enabled'"),
@@ -269,6 +278,47 @@ def test_the_camera_tells_its_own_calibration(tmp_path: Path) -> None:
         block = largest[marker]
         assert_allclose(ray[0] / ray[2], (block["center_x"] - 160.0) / 400.0)
         assert_allclose(ray[1] / ray[2], (block["center_y"] - 100.0) / 410.0)
+
+
+def test_corrections_count_more_than_what_the_car_publishes(tmp_path: Path) -> None:
+    fields = {"k": [400.0, 0, 160, 0, 410.0, 100, 0, 0, 1], "d": np.zeros(5)}
+    fields |= {"height": 208, "width": 316, "distortion_model": "plumb_bob"}
+    told = bags.Message("/agent8/pixy_node/camera_info", "sensor_msgs/msg/CameraInfo", 0, 0, fields)
+    lines = (
+        "[corrections.svea3]\nfocal_length = [200.0, 201.0]\ndistortion = [0.1, 0.0, 0.0, 0.0]\nwheel_scale = 0.25\n"
+    )
+    given = [*short(), told]
+    plain, bag = opened(tmp_path, MAP, given), opened(tmp_path / "new", MAP + lines + "gyro_bias = 0.5\n", given)
+    lens = replace(plain.log.lenses["svea3"], focal_length=(200.0, 201.0), distortion=(0.1, 0.0, 0.0, 0.0))
+    assert bag.log.lenses["svea3"] == lens and lens.principal_point == (160.0, 100.0)
+    pairs = [(a.value, b.value) for a, b in zip(plain.log.samples, bag.log.samples, strict=True)]
+    twists = [(a, b) for a, b in pairs if isinstance(a, Twist) and isinstance(b, Twist)]
+    for a, b in twists:
+        assert_allclose(b.linear, a.linear / 1.25)  # type: ignore[operator]
+        assert_allclose(b.angular, a.angular - [0.0, 0.0, 0.5])  # type: ignore[operator]
+    assert twists
+
+
+def test_a_lead_of_a_topic_holds_whatever_the_clock_of_its_car(tmp_path: Path) -> None:
+    lead, twist = 0.015, "/agent8/actuation_twist"
+    for ahead in (0.0, 0.4):
+        drive = bags.later(bags.later(short(), stamps=ahead, topics="/agent8"), stamps=-lead, topics=twist)
+        lines = f'[clocks]\nleads = {{ "{twist}" = {lead} }}\n'
+        bag = opened(tmp_path / f"{ahead}", MAP + lines, drive)
+        gaps = [s.stamp - bags.BEGIN for s in bag.log.samples if isinstance(s.value, Twist)]
+        at = [m.stamp for m in short() if m.topic == twist]
+        assert_allclose(gaps, at, atol=2e6)
+        assert bag.log.added["svea3", Role.WHEEL][1] == pytest.approx(lead - ahead, abs=2e-3)
+
+
+def test_motion_capture_far_from_the_map_is_warned_of(tmp_path: Path) -> None:
+    drive = [m for m in short() if "qualisys" not in m.topic]
+    for m in (m for m in short() if "qualisys" in m.topic):
+        place = m.fields["pose"].position
+        pose = codec.pose(np.eye(3), np.array([place.x + 1500.0, place.y, place.z]))
+        drive.append(replace(m, fields={"pose": pose}))
+    with pytest.warns(DataWarning, match=r"motion capture of svea3 is .* m from landmarks that span .* right\?"):
+        opened(tmp_path, MAP, drive)
 
 
 def test_a_camera_that_says_it_is_not_calibrated_has_the_calibration_of_the_environment(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from coopenv.base.errors import DataError
+from coopenv.cars.bags.topic_map import Correction
 from coopenv.cars.calibration import Calibrated, calibrate, toml_text
 from coopenv.cars.calibration.drives import CarDrive, Drive
 from coopenv.cars.vision import Calibration, rays
@@ -30,14 +31,20 @@ SCALE, BIAS = 0.02, 0.006
 
 
 def imaged(ray: np.ndarray, lens: Calibration) -> np.ndarray:
-    k1, k2, *_ = lens.distortion
+    k1, k2, k3, k4, *more = lens.distortion
     x, y = ray[:, 0] / ray[:, 2], ray[:, 1] / ray[:, 2]
-    radial = 1.0 + k1 * (x * x + y * y) + k2 * (x * x + y * y) ** 2
+    r2 = x * x + y * y
+    radial = 1.0 + k1 * r2 + k2 * r2**2
+    if len(more) == 4:
+        radial /= 1.0 + more[1] * r2 + more[2] * r2**2
+    elif not more:
+        a = np.arctan(np.sqrt(r2))
+        radial = a * (1.0 + k1 * a**2 + k2 * a**4 + k3 * a**6 + k4 * a**8) / np.sqrt(r2)
     return np.stack([x * radial, y * radial], axis=-1) * lens.focal_length + np.array(lens.principal_point)
 
 
 @cache
-def measured() -> dict[str, Any]:
+def measured(lens: Calibration = LENS) -> dict[str, Any]:
     """Return what a car measures that drives figures of eight, by formulas of its own."""
     rng, dt = np.random.default_rng(3), 0.001
     t = np.arange(0.0, 20.0, dt)
@@ -50,7 +57,7 @@ def measured() -> dict[str, Any]:
         flat = np.exp(-1j * yaw[k]) * (MARKERS[:, 0] + 1j * MARKERS[:, 1] - place[k])
         ray = (np.stack([flat.real, flat.imag, MARKERS[:, 2]], axis=-1) - LEVER) @ MOUNTING
         ahead = np.flatnonzero((ray[:, 2] > 0.2) & (np.abs(ray[:, 0]) < 0.75 * ray[:, 2]))
-        pixel = np.rint(imaged(ray[ahead], LENS) + 0.6 * rng.normal(size=(len(ahead), 2)))
+        pixel = np.rint(imaged(ray[ahead], lens) + 0.6 * rng.normal(size=(len(ahead), 2)))
         found += [
             (t[k], i, *p) for i, p in zip(ahead, pixel.tolist(), strict=True) if 2 < p[0] < 313 and 2 < p[1] < 205
         ]
@@ -75,12 +82,13 @@ def drive(
     markers: np.ndarray = MARKERS,
     late: float = 0.0,
     truth_late: float = 0.0,
+    seen_by: Calibration = LENS,
 ) -> Drive:
     """Return the drive as it looks to a calibration that is given these constants."""
-    tracks = dict(measured())
+    tracks = dict(measured(seen_by))
     seen = tracks.pop("seen")
     c, s = np.cos(turned), np.sin(turned)
-    ray, there = rays(seen[:, 2:], lens or LENS)
+    ray, there = rays(seen[:, 2:], lens or seen_by)
     seen, ray = seen[there], ray[there]
     car = CarDrive(
         name="car",
@@ -161,6 +169,52 @@ def test_bearings_alone_give_the_mounting_and_no_intrinsics() -> None:
     result = calibrate(replace(given, cars=(blind,)))
     assert off(result, "car.camera.z", 0.2233) < 3.0 and len(result.findings) == 1
     assert not any(row.name.endswith((".fx", ".k1")) for row in result.rows)
+
+
+MODELS = [(-0.2, 0.03, 0.0, 0.0, 0.0, 0.15, 0.02, 0.0), (-0.03, 0.01, -0.004, 0.001)]
+"""Coefficients of a rational model and of a fisheye."""
+
+
+@pytest.mark.parametrize("bent", rest_slow([(bent,) for bent in MODELS], 1))
+def test_other_models_of_a_lens_are_calibrated(bent: tuple[float, ...]) -> None:
+    lens = replace(LENS, distortion=bent)
+    given = drive(lens=replace(lens, focal_length=(220.0, 220.4)), seen_by=lens)
+    result = calibrate(replace(given, cars=(replace(given.cars[0], topics=TOPICS),)))
+    assert [line.split(" is wrong")[0] for line in result.findings] == ["car: focal length"]
+    assert off(result, "car.camera.fx", 213.161906) < 3.0 and off(result, "car.camera.fy", 213.521038) < 3.0
+    assert sum(row.name.startswith("car.camera.k") for row in result.rows) == (6 if len(bent) == 8 else 4)
+    written = tomllib.loads(toml_text(result))
+    found = Correction(**written["corrections"]["car"]).lens(given.cars[0].lens or LENS)
+    assert abs(found.focal_length[0] - 213.161906) < 1.0 and len(found.distortion) == len(bent)
+    assert not any("distortion" in key for key in written["overrides"]), "the environment has another model"
+
+
+TOPICS = (("/camera", -0.12), ("/wheels", -0.12), ("/truth", 0.3))
+
+
+def test_the_file_has_what_holds_for_other_drives() -> None:
+    """Delays of topics against the turn rates of their car, and errors of odometry; no offset of a clock."""
+    given = drive()
+    car = replace(given.cars[0], topics=TOPICS, gyro_added=-0.06)
+    result = calibrate(replace(given, cars=(car,)))
+    finding = {row.name: row.finding for row in result.rows}
+    assert finding["car.wheel.scale"] == "within the environment's noise" and finding["car.camera.fx"] == ""
+    written = tomllib.loads(toml_text(result))
+    assert written["clocks"] == {"leads": {"/camera": -0.06, "/wheels": -0.06}}
+    assert written["corrections"]["car"]["wheel_scale"] == pytest.approx(SCALE, abs=0.01)
+    assert written["corrections"]["car"]["gyro_bias"] == pytest.approx(BIAS, abs=0.003)
+    removed = {"wheel": car.wheel / (1.0 + SCALE), "gyro": car.gyro - BIAS, "corrected": (SCALE, BIAS)}
+    again = calibrate(replace(given, cars=(replace(car, **removed),)))
+    assert off(again, "car.wheel.scale", SCALE) < 3.0 and off(again, "car.gyro.bias", BIAS) < 3.0
+
+
+def test_turn_rates_in_degrees_are_named_and_give_no_overrides() -> None:
+    given = drive()
+    car = replace(given.cars[0], gyro=np.degrees(given.cars[0].gyro), topics=TOPICS)
+    result = calibrate(replace(given, cars=(car,)))
+    assert not result.explained and "its turn rates are 57." in result.findings[0] and "deg/s" in result.findings[0]
+    written = tomllib.loads(toml_text(result))
+    assert written["overrides"] == {} == written["clocks"]["leads"] and "corrections" not in written
 
 
 def test_the_file_sets_what_was_wrong() -> None:

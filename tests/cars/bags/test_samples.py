@@ -13,6 +13,7 @@ from coopenv.cars.bags.log import TopicRow
 from coopenv.cars.bags.topic_map import load_map
 from coopenv.cars.profile import Role
 from coopenv.cli import main
+from tests.helpers.commands import refused
 
 pytest.importorskip("rosbags", reason="needs the extra 'log'")
 
@@ -64,6 +65,11 @@ def test_the_proposed_map_reads_what_the_written_one_reads(tmp_path: Path) -> No
     own, written = (Bag([SAMPLES / "mcap"], where) for where in (path, SAMPLES / "topics.toml"))
     assert sorted(map(repr, own.log.samples)) == sorted(map(repr, written.log.samples))
     assert main(["import", str(SAMPLES / "mcap"), "--propose", str(path)]) == 2  # is there
+
+
+def test_a_map_is_written_where_there_is_a_folder(tmp_path: Path) -> None:
+    path = tmp_path / "none" / "topics.toml"
+    assert f"{path.parent} does not exist" in refused("import", str(SAMPLES / "mcap"), "--propose", str(path))
 
 
 def row(topic: str, kind: str, messages: int = 10) -> TopicRow:
