@@ -117,13 +117,17 @@ def _bearings(message: Any, _settings: VisionSettings, camera: Calibration | Non
 
 def _frame(message: Any, settings: VisionSettings, camera: Calibration) -> list[Tag]:
     """Return the tags, or the blobs of colour, in an Image or CompressedImage."""
-    frame = frame_of(message, "BGR" if settings.colours else "GRAY")
-    if frame.shape[1::-1] != camera.image_size:
-        width, height = camera.image_size
-        raise CoopenvError(f"{frame.shape[1]} x {frame.shape[0]} pixels, the camera model has {width} x {height}")
-    if settings.colours:
-        return find_blobs(frame, settings.colours, camera)
-    return find_tags(frame, settings.family, camera)
+    try:
+        frame = frame_of(message, "BGR" if settings.colours else "GRAY")
+        if frame.shape[1::-1] != camera.image_size:
+            width, height = camera.image_size
+            raise CoopenvError(f"{frame.shape[1]} x {frame.shape[0]} pixels, the camera model has {width} x {height}")
+        if settings.colours:
+            return find_blobs(frame, settings.colours, camera)
+        return find_tags(frame, settings.family, camera)
+    except opencv().error as error:  # such as an odd width of a format that has a colour for two pixels
+        kind = f"{message.width} x {message.height} {message.encoding}" if hasattr(message, "encoding") else "a frame"
+        raise CoopenvError(f"data: OpenCV does not read {kind}: {shown(error.err)}") from None
 
 
 def _apriltags(message: Any, _settings: VisionSettings, camera: Calibration) -> list[Tag]:

@@ -155,3 +155,11 @@ def test_what_is_wrong_is_one_line() -> None:
         frame_of(make("sensor_msgs/msg/Image", width=1, height=1, step=1, encoding="yuv444", data=[0]))
     with pytest.raises(CoopenvError, match="no image that OpenCV reads"):
         frame_of(make("sensor_msgs/msg/CompressedImage", format="jpeg", data=[1, 2, 3]))
+    odd = {"width": 63, "height": 48, "step": 126, "encoding": "yuv422", "data": np.zeros(126 * 48, np.uint8)}
+    with pytest.raises(CoopenvError, match=r"detections: data: OpenCV does not read 63 x 48 yuv422: ") as caught:
+        camera, settings = (
+            Calibration((63, 48), (50.0, 50.0), (32.0, 24.0), (0.0,) * 5),
+            VisionSettings(colours=COLOURS),
+        )
+        read(Role.DETECTIONS, make("sensor_msgs/msg/Image", **odd), camera, vision=settings)
+    assert "\n" not in str(caught.value)
