@@ -376,6 +376,14 @@ class Deployment(Section):
         return self.cars[names.index(name)]
 
 
+class IdentifiedFile(Section):
+    """What `coopenv identify` writes."""
+
+    overrides: dict[str, Any]
+    fake: dict[str, Any]
+    constants: dict[str, Any] = Field(default={})
+
+
 def load_deployment(path: str | Path, connect: str | None = None) -> Deployment:
     """Read a deployment file.
 
@@ -393,6 +401,7 @@ def load_deployment(path: str | Path, connect: str | None = None) -> Deployment:
         raw["network"] = {**network, "connect": [connect]}
     if isinstance(name := raw.get("identified"), str):
         found = read_toml(path.parent / name, DeploymentError)
+        validated(IdentifiedFile, json.dumps(found, default=str), f"{path.name}: identified: {name}", DeploymentError)
         raw = with_tables(raw, found, ("overrides", "fake"), f"{path.name} and {name}", DeploymentError)
     return parse_deployment(raw, path)
 

@@ -31,8 +31,8 @@ STOPPED = 3
 @svea.command()
 def demo(
     environment: Annotated[
-        str, typer.Option(help="The experiment: svea_overtaking or svea_crossing.")
-    ] = "svea_overtaking",
+        str | None, typer.Option(help="The experiment: svea_overtaking (default) or svea_crossing.")
+    ] = None,
     fleet: Annotated[
         Path | None, typer.Option(help="Or a deployment file of your own, whose cars are fakes (fakes = true).")
     ] = None,
@@ -61,7 +61,9 @@ def demo(
     """
     from coopenv.runs.demo import Demo
 
-    name = environment if fleet is None else fleet.stem
+    if environment is not None and fleet is not None:
+        raise CoopenvError(f"--environment: {fleet} names one; give --environment or --fleet")
+    name = (environment or "svea_overtaking") if fleet is None else fleet.stem
     folder = out or Path("out") / name
     chosen = Demo(name, folder, policy, seed, options.parse_overrides(overrides), seconds, beside, fleet)
     if not chosen.run(port, options.console(stderr=True), options.console()):

@@ -36,6 +36,7 @@ from coopenv.runs.demo import FLEETS, Demo, links_line, links_report
 from coopenv.runs.rollouts import Rollout
 from coopenv.viz.trajectories import trajectory_figure_2d
 from tests.helpers.cars import OVERTAKING, cars, fakes, write_fleet
+from tests.helpers.commands import refused
 from tests.helpers.hub import Hub
 from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, mentioning, start, wait_until
 from tests.helpers.wire import free_endpoint
@@ -229,6 +230,11 @@ def test_a_station_that_is_killed_leaves_its_drive(fleet: tuple[Path, str], tmp_
 
 
 PATIENT = "odometry_age = 2.0\nmissed_deadlines = 60\n"
+
+
+def test_a_fleet_has_an_environment() -> None:
+    line = refused("svea", "demo", "--fleet", "mine.toml", "--environment", "svea_crossing")
+    assert "--environment: mine.toml names one; give --environment or --fleet" in line
 
 
 def test_cars_that_say_nothing_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -243,7 +243,8 @@ class StatusBoard:
         for name, tolerance in TOLERANCES.items() if published is not None else ():
             a, b = getattr(published, name), getattr(used, name)
             if len(a) != len(b) or (np.abs(np.subtract(a, b)) > tolerance).any():
-                yield f"its camera publishes {name} = {list(a)}, the environment has {list(b)}"
+                wrong = "correct its CameraInfo, or [camera] of the environment"
+                yield f"its camera publishes {name} = {list(a)}, the environment has {list(b)}: {wrong}"
 
     def happened(self, car: str) -> str:
         """Return the reason to stop an armed car by its conditions since arming; empty: none."""

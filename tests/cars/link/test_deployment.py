@@ -132,6 +132,12 @@ BAD = {
 }
 
 
+def test_identified_takes_the_result_of_identify_alone(tmp_path: Path) -> None:
+    (tmp_path / "cal.toml").write_text("[overrides]\n[clocks.leads]\n[constants]\n", encoding="utf-8")
+    with pytest.raises(DeploymentError, match=r"lab\.toml: identified: cal\.toml: clocks: unknown key"):
+        load_deployment(written(tmp_path, 'identified = "cal.toml"\n' + GOOD))
+
+
 def test_of_another_kind_of_file_all_keys_are_listed() -> None:
     """The nearest key helps after a typing error alone."""
     with pytest.raises(DeploymentError, match=r"^svea_overtaking\.toml: title: unknown key; allowed: cars, "):
