@@ -22,7 +22,7 @@ from coopenv.cars.bags.clocks import checked
 from coopenv.cars.bags.files import BagFile, check_extra
 from coopenv.cars.bags.log import NS, TopicRow, read_log, regularity
 from coopenv.cars.bags.topic_map import READ, TOPIC, UNNEEDED, TopicMap, load_map
-from coopenv.cars.profile import IMAGES, VELOCITY, Role
+from coopenv.cars.profile import IMAGES, SVEA, VELOCITY, Role
 from coopenv.cars.readings import POSES, READERS, CarPose, Sample, read
 from coopenv.cars.vision import Calibration
 from coopenv.scenario import Scenario, load_scenario
@@ -156,6 +156,7 @@ COMMANDED = re.compile(r"cmd|command|setpoint|target", re.IGNORECASE)
 """In names of topics that hold commands, whose types are those of measured twists."""
 ANY_CAMERA = Calibration((100_000, 100_000), (1e5, 1e5), (5e4, 5e4), (0.0,) * 5)
 """That has seen whatever was detected."""
+TO_WHEELS = (SVEA.topics[Role.MANUAL].type,)
 DRIFTING = 1e-5  # s per s from which a clock's drift is mentioned
 
 
@@ -249,7 +250,7 @@ def role_of(row: TopicRow) -> Role | None:
     if row.type in POSES and CAPTURE.search(row.topic):
         return Role.TRUTH
     order = (Role.ODOMETRY, *READ) if row.type == "nav_msgs/msg/Odometry" else (Role.WHEEL, *READ)
-    return next((role for role in order if role in READ and row.type in READERS[role]), None)
+    return next((role for role in order if role in READ and row.type in READERS.get(role, TO_WHEELS)), None)
 
 
 def _markers(files: Sequence[BagFile], used: set[str]) -> Counter[int]:

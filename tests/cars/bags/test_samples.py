@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from coopenv.cars.bags import Bag, cars_of, examined, proposed
+from coopenv.cars.bags import Bag, cars_of, examined, proposed, role_of
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.log import TopicRow
 from coopenv.cars.bags.topic_map import load_map
@@ -99,6 +99,11 @@ def row(topic: str, kind: str, messages: int = 10) -> TopicRow:
 )  # fmt: skip
 def test_cars_are_found_by_names_and_types(rows: list[TopicRow], cars: dict[str, dict[str, str]]) -> None:
     assert cars_of(rows) == {car: {Role(r): t for r, t in topics.items()} for car, topics in cars.items()}
+
+
+def test_topics_of_other_types_are_left_out_and_commands_to_the_wheels_are_not() -> None:
+    assert role_of(row("/words", "std_msgs/msg/String")) is None
+    assert role_of(row("/send", "mavros_msgs/msg/ManualControl")) is Role.MANUAL
 
 
 def test_without_a_camera_nothing_is_proposed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
