@@ -8,7 +8,7 @@ import platform
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from functools import cache
 from hashlib import sha256
 from importlib import import_module, metadata
@@ -213,7 +213,7 @@ def load_reference(reference: str) -> Any:
     """Return the object of a reference.
 
     Modules are looked for in the current folder too, and those that a file imports in its own. A file is loaded once,
-    and again after it has changed.
+    and again after it has changed. What it prints goes to standard error: standard output may be a document.
 
     Raises:
         CoopenvError: there is no such file, module or name, or its code raises something.
@@ -221,11 +221,8 @@ def load_reference(reference: str) -> Any:
     place, _, name = reference.rpartition(":")
     path = check_reference(reference)
     try:
-        if path is not None:
-            module = _module_of(path, path.stat().st_mtime_ns)
-        else:
-            with _importing_from(Path.cwd()):
-                module = import_module(place)
+        with redirect_stdout(sys.stderr), _importing_from(Path.cwd()) if path is None else nullcontext():
+            module = _module_of(path, path.stat().st_mtime_ns) if path is not None else import_module(place)
     except (Exception, SystemExit) as error:  # anybody's code
         raise CoopenvError(f"'{reference}' cannot be loaded: {error_text(error)}") from error
     if not hasattr(module, name):

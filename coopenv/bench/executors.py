@@ -24,7 +24,15 @@ from typing import Any, TypeVar
 import psutil
 
 from coopenv.base.errors import CoopenvError, error_text, shown
-from coopenv.base.installation import ONE_THREAD, available_cores, environment, install_command, needing
+from coopenv.base.installation import (
+    ONE_THREAD,
+    available_cores,
+    environment,
+    install_command,
+    is_reference,
+    load_reference,
+    needing,
+)
 from coopenv.base.interrupts import end_with_parent, held
 
 POLL = 0.1  # s between two looks at the processes
@@ -59,8 +67,12 @@ def _deaf_children() -> Iterator[None]:
 
 
 def _work(pipe: Connection) -> None:
-    """Do tasks as they come: send (part,) each, then () or the exception that ended the task."""
+    """Do tasks as they come: send (part,) each, then () or the exception that ended the task.
+
+    What tasks print goes to standard error: standard output is the parent's document.
+    """
     end_with_parent()
+    os.dup2(2, 1)
     while True:
         try:
             task, done, ended = pipe.recv()
@@ -99,14 +111,14 @@ class _Worker:
         memory = sum(member.memory_info().rss for member in family) / 2**20
         return sum(time.user + time.system for time in times), monotonic(), memory
 
-    def excess(self, limits: Limits) -> tuple[str, bool] | None:
-        """Return the limit that the present part exceeds, in words, and whether it ends all like it; None: no limit."""
+    def excess(self, limits: Limits, where: str) -> tuple[str, str] | None:
+        """Return the limit that the present part exceeds, in words, and the end of the reason; None: no limit."""
         with suppress(psutil.Error):  # it has ended, and its pipe with it
             time, clock, memory = (now - then for now, then in zip(self.measured(), self.before, strict=True))
             if time > limits.seconds or clock > PATIENCE * limits.seconds:
-                return f"more than {limits.seconds:g} s on one record (--seconds){NOT_RUN}", True
+                return f"more than {limits.seconds:g} s{where} (--seconds)", NOT_RUN
             if memory > limits.mebibytes:
-                return f"more than {limits.mebibytes:g} MiB of memory (--memory)", False
+                return f"more than {limits.mebibytes:g} MiB of memory (--memory)", ""
         return None
 
     def end(self) -> str:
@@ -187,14 +199,16 @@ class Pool:
                     self._fail(worker, "")
                 else:
                     finished = self._take(worker, message) or finished
-            elif worker.started and self.limits is not None and (excess := worker.excess(self.limits)):
-                self._fail(worker, *excess)
+            elif worker.started and self.limits is not None:
+                where = "" if isinstance(self.tasks[worker.number], _Whole) else " on one record"
+                if excess := worker.excess(self.limits, where):
+                    self._fail(worker, *excess)
         return finished
 
     def _take(self, worker: _Worker, message: Any) -> bool:
         """Take a message of a worker; return whether its task is finished."""
         if isinstance(message, BaseException):
-            if not worker.started or self.limits is None:
+            if not worker.started or self.limits is None or isinstance(self.tasks[worker.number], _Whole):
                 raise message
             self._fail(worker, str(message) if isinstance(message, CoopenvError) else error_text(message))
         elif message:
@@ -207,15 +221,16 @@ class Pool:
             worker.number = -1
         return worker.number < 0
 
-    def _fail(self, worker: _Worker, reason: str, everywhere: bool = False) -> None:
-        """End a worker, and its observer in this world or everywhere; the rest of its task waits for another worker."""
+    def _fail(self, worker: _Worker, reason: str, end: str = "") -> None:
+        """End a worker, and its observer in this world, or with `NOT_RUN` everywhere; the rest of its task waits."""
         number, ended = worker.number, worker.end()
         self.workers.remove(worker)
         if not worker.started or self.limits is None:
             raise CoopenvError(f"a process died: out of memory, or killed, or an observer ended it ({ended})")
-        task = self.tasks[number]
-        observer, world = [*task.observers][len(self.results[number])], None if everywhere else task.world
-        self.ended.append((observer, world, f"with seed {task.seed}: {reason or ended}"))
+        if isinstance(task := self.tasks[number], _Whole):
+            raise CoopenvError(f"'{task.task}' cannot be loaded: {reason or ended}")
+        observer, world = [*task.observers][len(self.results[number])], None if end else task.world
+        self.ended.append((observer, world, f"with seed {task.seed}: {reason or ended}{end}"))
         self.waiting.appendleft(number)
 
 
@@ -321,6 +336,21 @@ class Ray:
 
 
 Executor = Local | Ray
+
+
+def check_imports(executor: Executor, observers: Sequence[str]) -> None:
+    """Load import paths in other processes first, under the limits of an executor that has some.
+
+    Raises:
+        CoopenvError: one cannot be loaded, ends its process or exceeds a limit.
+    """
+    if isinstance(executor, Local) and executor.limits is not None:
+        tasks = [_Whole(_load, name) for name in observers if is_reference(name)]
+        Pool(tasks, executor.jobs, executor.limits).run(lambda done: None)
+
+
+def _load(reference: str) -> None:
+    load_reference(reference)
 
 
 def find_executor(

@@ -24,7 +24,7 @@ from rich.table import Table
 from coopenv.base.errors import CoopenvError, ScenarioWarning, check_one_of, listed
 from coopenv.base.format import in_parentheses, jsonable, number
 from coopenv.base.installation import data_directory, is_reference, versions
-from coopenv.bench.executors import Limits, Local
+from coopenv.bench.executors import Limits, Local, check_imports
 from coopenv.bench.observers.comparison import Comparison, Plan
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.judge import judge_all
@@ -126,12 +126,13 @@ class Frozen:
         on_progress: Callable[[float], None],
     ) -> dict[str, Any]:
         """Return the content of the result file of observers in some scenes, all without names."""
-        scenes, share = self.scenes(names), self.definition["steady_from"]
+        scenes, share, executor = self.scenes(names), self.definition["steady_from"], Local(jobs, limits)
+        check_imports(executor, observers)
         plans = [
             Plan.of(observers, s.source, self.seeds, [s.variant], share * s.source.scenario.horizon, ()) for s in scenes
         ]
         tasks = [task for plan in plans for task in plan.tasks]
-        judged = iter(judge_all(Local(jobs, limits), tasks, lambda done: on_progress(done / len(tasks))))
+        judged = iter(judge_all(executor, tasks, lambda done: on_progress(done / len(tasks))))
         boards = {s.name: p.compared(islice(judged, len(self.seeds))) for s, p in zip(scenes, plans, strict=True)}
         found = {s.name: {"hash": s.hash, "records": _figures(boards[s.name])} for s in scenes}
         rows = [row_of(name, board, observer) for name, board in boards.items() for observer in board.observers]

@@ -144,7 +144,7 @@ OF_THE_OUTPUT = ("jobs", "engine", "address", "seconds", "memory", "out", "figur
 @options.command
 def bench_observers(given: ObserverOptions) -> None:
     """Compare observers on the same data and with their bound."""
-    from coopenv.bench.executors import find_executor
+    from coopenv.bench.executors import check_imports, find_executor
     from coopenv.bench.observers.command import REPORT_FILE, perform
     from coopenv.bench.observers.convergence import check_source
 
@@ -153,6 +153,8 @@ def bench_observers(given: ObserverOptions) -> None:
     if given.width is not None and given.figures is None:
         raise CoopenvError(f"--width {given.width.value}: is for files of figures, --figures pdf")
     printed, log = options.console(), options.console(stderr=True)
+    executor = find_executor(given.engine, given.jobs, given.address, given.seconds, given.memory)
+    check_imports(executor, given.names or ())
     plan = given.plan()
     if given.basin:
         check_source(plan.source)
@@ -160,7 +162,7 @@ def bench_observers(given: ObserverOptions) -> None:
     board = perform(
         plan,
         given.command_of(plan),
-        find_executor(given.engine, given.jobs, given.address, given.seconds, given.memory),
+        executor,
         printed,
         log,
         basin=given.basin,
@@ -213,11 +215,13 @@ def bench_v1(
     replace_text(out, json_text(result))
     if as_json:
         options.print_json(result)
-        return
-    printed = options.console()
-    for part in frozen.report(benchmark, result):
-        printed.print(part, soft_wrap=isinstance(part, str), markup=False)
-    printed.print(f"{out}: the result file", soft_wrap=True)
+    else:
+        printed = options.console()
+        for part in frozen.report(benchmark, result):
+            printed.print(part, soft_wrap=isinstance(part, str), markup=False)
+        printed.print(f"{out}: the result file", soft_wrap=True)
+    if lost := [total["observer"] for total in result["totals"] if total["failed"] == len(result["scenes"])]:
+        raise CoopenvError(f"failed in every scene: {listed(lost)}")
 
 
 @bench.command("learning")

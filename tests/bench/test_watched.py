@@ -15,6 +15,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.bench.executors import NOT_RUN, Limits, _work, find_executor
 from coopenv.bench.frozen import Frozen, report
 from coopenv.cli import main
+from tests.helpers.commands import refused
 from tests.helpers.processes import DEADLOCK
 
 PLUGINS = '''
@@ -136,6 +137,32 @@ def test_an_observer_that_takes_too_long_is_not_tried_in_other_scenes(
         assert log.count(name) == seeds * vehicles
         [line] = [part for part in report(benchmark, result) if isinstance(part, str) and part.startswith(f"My{name}")]
         assert line.endswith(NOT_RUN) == (name == "Loops")
+
+
+@pytest.mark.parametrize("command", [["v1"], ["observers", "overtaking", "--observers"]])
+def test_code_that_ends_or_blocks_its_process_when_loaded_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]
+) -> None:
+    for name, code in (("ends", "os._exit(0)"), ("loops", "while True: pass")):
+        (tmp_path / f"{name}.py").write_text(f"import os\nclass Mine: pass\n{code}\n")
+    monkeypatch.chdir(tmp_path)
+    ended = refused("bench", *command, "ends.py:Mine,dead_reckoning", "--seconds", "9")
+    assert ended == "error: 'ends.py:Mine' cannot be loaded: its process ended with status 0\n"
+    late = refused("bench", *command, "dead_reckoning,loops.py:Mine", "--seconds", "0.5")
+    assert late == "error: 'loops.py:Mine' cannot be loaded: more than 0.5 s (--seconds)\n"
+
+
+def test_standard_output_is_one_document_and_the_status_that_of_a_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever code prints when it is loaded or run, and by any means."""
+    prints = "print('loaded')\nclass Prints(Fine):\n    def misbehave(self):\n        os.write(1, b'run')\n"
+    (tmp_path / "mine.py").write_text(PLUGINS + prints + "        0 / 0\n")
+    monkeypatch.chdir(tmp_path)
+    assert main(["bench", "v1", "mine.py:Prints", "--scenes", "lane", "--jobs", "1", "--json"]) == 2
+    out, err = capfd.readouterr()
+    assert json.loads(out)["totals"][0]["failed"] == 1
+    assert "loaded" in err and "run" in err and err.endswith("error: failed in every scene: Prints\n")
 
 
 @pytest.mark.slow
