@@ -8,7 +8,7 @@ import shlex
 import sys
 import tomllib
 import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from enum import Enum, StrEnum
@@ -360,18 +360,31 @@ def command_text(words: str, given: Any, leave_out: Collection[str] = ()) -> str
         value = getattr(given, field.name)
         if field.name in leave_out or (not value and value == field.default):
             continue
-        option = next(part for part in kinds[field.name].__metadata__ if hasattr(part, "param_decls"))
         texts = [
             str(one.value if isinstance(one, Enum) else one) for one in (value if isinstance(value, list) else [value])
         ]
-        if isinstance(option, typer.models.ArgumentInfo):
+        if not (name := _option(field.name, kinds)):
             arguments += texts
-            continue
-        name = next((w for w in (option.default, *(option.param_decls or ())) if str(w).startswith("--")), "")
-        name = name.partition("/")[0] or f"--{field.name.replace('_', '-')}"
-        for text in texts:
+        for text in texts if name else ():
             named += [name] if value is True else [name.replace("--", "--no-", 1)] if value is False else [name, text]
     return shlex.join(["coopenv", *words.split(), *arguments, *named])
+
+
+def _option(field: str, kinds: Mapping[str, Any]) -> str:
+    """Return the option of a field of a record, from the fields' types; empty: it is an argument."""
+    option = next(part for part in kinds[field].__metadata__ if hasattr(part, "param_decls"))
+    if isinstance(option, typer.models.ArgumentInfo):
+        return ""
+    name = next((w for w in (option.default, *(option.param_decls or ())) if str(w).startswith("--")), "")
+    return name.partition("/")[0] or f"--{field.replace('_', '-')}"
+
+
+def refuse(given: Any, names: Collection[str], reason: str) -> None:
+    """Refuse the fields of a record of options that differ from their defaults. Raises CoopenvError: one does."""
+    for field in fields(given):
+        if field.name in names and getattr(given, field.name) != field.default:
+            option = _option(field.name, get_type_hints(type(given), include_extras=True))
+            raise CoopenvError(f"{option}: {reason}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from pathlib import Path
 from shlex import quote
@@ -55,7 +55,9 @@ def run(given: RunOptions) -> None:
     The file of an earlier run, which `coopenv bundle` wrote, runs again and is compared.
     """
     if given.environment.endswith(BUNDLE):
-        replay(Path(given.environment))
+        others = {field.name for field in fields(given)} - {"environment", "as_json"}
+        options.refuse(given, others, f"is for a new run, {given.environment} is replayed as it was")
+        replay(Path(given.environment), given.as_json)
         return
     name = Path(given.environment).stem
     refuse_for_recordings(given.environment, seed=given.seed, policy=given.policy)
@@ -90,7 +92,7 @@ def run(given: RunOptions) -> None:
 BUNDLE = ".zip"
 
 
-def replay(path: Path) -> None:
+def replay(path: Path, as_json: bool = False) -> None:
     """Run a bundle again. Raises CoopenvError: it is not valid, or something else comes out."""
     from coopenv.runs.bundle import Bundle
 
@@ -99,6 +101,9 @@ def replay(path: Path) -> None:
         options.console(stderr=True).print(f"note: made with {', '.join(others)}", soft_wrap=True)
     if differing := bundle.replay():
         raise CoopenvError(f"{path}: another result than that of the file: {'; '.join(differing)}")
+    if as_json:
+        options.print_json(bundle.manifest.model_dump(include={"environment", "seed", "policy", "observer", "end"}))
+        return
     printed.print(f"{path}: {bundle.title}", soft_wrap=True)
     end = bundle.manifest.end
     same = "The same figures up to the driver's error" if end.by_driver else "The same error"

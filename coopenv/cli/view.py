@@ -180,6 +180,10 @@ def film(given: FilmOptions) -> None:
     from coopenv.runs.films import check_film, write_film
 
     out, log = given.out, options.console(stderr=True)
+    if given.space:
+        options.refuse(given, ("map_only",), "is for a film from above, without --3d")
+    else:
+        options.refuse(given, ("camera", "vehicle"), "is for a 3-D film, with --3d")
     rate = given.fps or (20.0 if out.suffix == ".mp4" else 10.0)
     check_film(out)
     check_file(out)

@@ -1,8 +1,8 @@
 """A run as one checked file, which `coopenv run` replays: scenario, seed, actions, versions, and a state near its end.
 
 A ZIP archive of `manifest.json`, `scenario.json`, `arrays.npz` and, to read, `code/NAME.py`: the user's files of an
-observer and of terms. The manifest holds the digest of every other part. Code in the archive is never executed: a
-replay needs the same files in the current folder.
+observer and of terms. The manifest holds the digest of every other part, the archive's comment that of the manifest.
+Code in the archive is never executed: a replay needs the same files in the current folder.
 """
 
 import json
@@ -30,7 +30,8 @@ from coopenv.scenario.own_terms import located
 from coopenv.world.warp_internals import kernel_hashes
 
 RECORD_FILE = "record.zip"
-PARTS = {"manifest.json": 2**20, "scenario.json": 2**24, "arrays.npz": 2**28}
+MANIFEST = "manifest.json"
+PARTS = {MANIFEST: 2**20, "scenario.json": 2**24, "arrays.npz": 2**28}
 """Names of the parts with the most bytes that each may unpack to."""
 CODE, MOST_CODE = re.compile(r"code/[^/\\]+\.py"), 2**20
 """Names of the parts with code, and the most bytes of one."""
@@ -141,8 +142,10 @@ class RunRecord:
             end=RunEnd(tick=self.last, error=str(error or ""), by_driver=by_driver, figures=figures_of(run)),
             parts={name: sha256(content).hexdigest() for name, content in parts.items()},
         )
+        parts[MANIFEST] = json_text(manifest.model_dump()).encode()
         with replacing_file(path) as new, zipfile.ZipFile(new, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, content in {"manifest.json": json_text(manifest.model_dump()).encode(), **parts}.items():
+            archive.comment = sha256(parts[MANIFEST]).hexdigest().encode()
+            for name, content in parts.items():
                 archive.writestr(name, content)
 
 
@@ -173,9 +176,10 @@ class Bundle:
                 if wrong or missing:
                     raise DataError(f"{path}: not a run: parts {listed(missing or wrong)}")
                 parts = {name: archive.open(name).read(size) for name, size in sizes.items()}
-            manifest = validated(Manifest, parts.pop("manifest.json"), f"{path}: manifest.json", DataError)
+            manifest = validated(Manifest, parts[MANIFEST], f"{path}: {MANIFEST}", DataError)
+            digests = {**manifest.parts, MANIFEST: archive.comment.decode()}
             for name, content in parts.items():
-                if manifest.parts.get(name) != sha256(content).hexdigest():
+                if digests.get(name) != sha256(content).hexdigest():
                     raise DataError(f"{path}: {name}: not the part that was written, its digest differs")
             with zipfile.ZipFile(BytesIO(parts["arrays.npz"])) as inner:
                 if any(part.compress_type != zipfile.ZIP_STORED for part in inner.infolist()):
@@ -244,7 +248,7 @@ class Bundle:
                     break
         except CoopenvError as failure:
             error = str(failure)
-        if kernels := [n for n, digest in kernel_hashes().items() if about.kernels.get(n, digest) != digest]:
+        if kernels := [n for n, digest in kernel_hashes().items() if about.kernels.get(n) != digest]:
             differing.append(f"kernels {listed(kernels)}")
         if (last, error) != (end.tick, "" if end.by_driver else end.error):
             differing.append(f"after tick {last}: {error or 'no error'}")

@@ -59,15 +59,17 @@ def run(*more: str) -> list[str]:
 
 
 def edited(file: Path, change: Callable[[dict[str, bytes]], None], sealed: bool = True) -> str:
-    """Write a file with changed parts, and with their digests if `sealed`; return its name."""
+    """Write a file with changed parts, and with all digests if `sealed`; return its name."""
     with zipfile.ZipFile(file) as archive:
-        parts = {name: archive.read(name) for name in archive.namelist()}
+        parts, comment = {name: archive.read(name) for name in archive.namelist()}, archive.comment
     change(parts)
     if sealed:
         manifest = json.loads(parts["manifest.json"])
         manifest["parts"] = {n: sha256(c).hexdigest() for n, c in parts.items() if n != "manifest.json"}
         parts["manifest.json"] = json.dumps(manifest).encode()
+        comment = sha256(parts["manifest.json"]).hexdigest().encode()
     with zipfile.ZipFile("edited.zip", "w") as archive:
+        archive.comment = comment
         for name, content in parts.items():
             archive.writestr(name, content)
     return "edited.zip"
@@ -162,6 +164,9 @@ def test_large_seeds_are_replayed(folder: Path, capsys: pytest.CaptureFixture[st
 def test_a_run_is_replayed_and_differences_are_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(run("--steps", "30")) == 0 and main(["bundle", "run"]) == 0
     assert main(["run", "run.zip"]) == 0 and capsys.readouterr().out.endswith("The same figures.\n")
+    assert main(["run", "run.zip", "--json"]) == 0 and json.loads(capsys.readouterr().out)["end"]["tick"] == 90
+    for option, *value in (["--seed", "3"], ["--override", "horizon=3"], ["--open"]):
+        assert refused("run", "run.zip", option, *value).startswith(f"error: {option}: is for a new run, run.zip is")
     with zipfile.ZipFile("run.zip") as archive, np.load(io.BytesIO(archive.read("arrays.npz"))) as kept:
         actions, position = kept["actions"], kept["state.position"]
     assert len(actions) == 30 and np.abs(actions).max() > 0.1
@@ -188,6 +193,8 @@ def test_what_is_no_such_file_is_refused_in_one_line(folder: Path) -> None:
     assert "holds no record.zip, as only simulated runs do" in refused("bundle", ".")
     cases: list[tuple[Callable[[dict[str, bytes]], None], bool, str]] = [
         (lambda parts: arrays(parts, actions=np.zeros((4, 1, 2))), False, "arrays.npz: not the part that was written"),
+        (manifest("observer", "riccati"), False, "manifest.json: not the part that was written, its digest differs"),
+        (manifest("kernels", {"a": "b"}), True, "another result than that of the file: kernels coopenv."),
         (lambda parts: arrays(parts, pack=np.savez_compressed), True, "arrays.npz: is packed twice"),
         (lambda parts: arrays(parts, actions=np.full((4, 1, 2), 7.0)), True, "actions: expected numbers from -1 to 1"),
         (lambda parts: arrays(parts, actions=np.zeros((4, 9, 2))), True, "actions: expected (1, 2) per decision"),
