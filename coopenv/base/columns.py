@@ -48,6 +48,8 @@ class Columns:
     """Columns of equal length, by name."""
     keys: tuple[str, ...]
     """Columns whose values together name a row."""
+    mixed: tuple[str, ...] = ()
+    """Columns of numbers whose units differ from row to row."""
 
     @classmethod
     def of_rows(cls, rows: Sequence[Any], *keys: str) -> Columns:
@@ -56,8 +58,9 @@ class Columns:
 
     @property
     def units(self) -> dict[str, str]:
-        """The unit of every column of numbers."""
-        numbers = [name for name, values in self.values.items() if np.asarray(values).dtype.kind in "fiu"]
+        """The unit of every column of numbers that has one."""
+        known = {name: values for name, values in self.values.items() if name not in self.mixed}
+        numbers = [name for name, values in known.items() if np.asarray(values).dtype.kind in "fiu"]
         return {name: next((u for end, u in UNITS.items() if name.endswith(end)), "1") for name in numbers}
 
     def csv(self) -> str:
@@ -143,7 +146,7 @@ class Tabular(Explained, ABC):
             CoopenvError: pandas or pyarrow is not installed, or the file cannot be written.
         """
         frame = self.to_pandas(**options)
-        with needing(f"Parquet needs pyarrow: {INSTALL}"), replacing_file(Path(path)) as new:
+        with needing(f"Parquet needs pyarrow: {INSTALL}"), replacing_file(path) as new:
             frame.to_parquet(new, engine="pyarrow")
 
 

@@ -8,7 +8,7 @@ from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -17,7 +17,7 @@ from rich.table import Table
 
 from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
-from coopenv.base.columns import WIDTH, Columns, Tabular, one_line, terminal_html
+from coopenv.base.columns import WIDTH, Columns, Tabular, one_line, picture_html, terminal_html
 from coopenv.base.errors import ActionError, CoopenvError, check_one_of, checked_seed
 from coopenv.base.files import check_file, replace_text
 from coopenv.base.format import NONE, json_text
@@ -28,6 +28,9 @@ from coopenv.policies import Agent, Policy, agents_for, find_agent
 from coopenv.policies.loader import CARD_FILES
 from coopenv.runs.console import number_table
 from coopenv.scenario import Scenario, ScenarioLike, scenario_name
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 BASELINE, IDEAL = "route_follower", "ideal_sensing"
 """Reference of all comparisons, and the name of the same driver under ideal sensing."""
@@ -60,6 +63,10 @@ def stress(scenario: Scenario) -> dict[str, dict[str, Any]]:
         "initial error x 2": {"randomisation.initial_error": [2.0, 2.0]},
         **(OF_MESSAGES if len(scenario.vehicles) > 1 else {}),
     }
+
+
+KINDS: "dict[str, Callable[[Evaluation, float | None], Figure]]" = {}
+"""Functions that draw the figures of an evaluation, which `evaluate` adds."""
 
 
 @dataclass(frozen=True)
@@ -195,15 +202,40 @@ class Evaluation(Contest, Tabular):
         ]
 
     def columns(self) -> Columns:
-        """Return `rows` with the unit of each metric."""
+        """Return `rows`, the figures in the column `unit`."""
         rows = [{**row, "unit": METRICS[row["metric"]].unit} for row in self.rows]
-        return Columns({name: [row[name] for row in rows] for name in rows[0]}, ("agent", "metric"))
+        return Columns(
+            {name: [row[name] for row in rows] for name in rows[0]}, ("agent", "metric"), ("mean", "ci_low", "ci_high")
+        )
 
     def __repr__(self) -> str:
         return one_line(self, self.environment, {"agents": tuple(self.episodes), "worlds": self.worlds})
 
+    def figure(
+        self,
+        kind: str = "time_against_error",
+        *,
+        width: str | float | None = None,
+        path: str | Path | None = None,
+        format: str | None = None,
+    ) -> "Figure":
+        """Draw a figure, and write it where a path is given; width, path, format and errors as of `Comparison.figure`.
+
+        `kind` is "error_along_the_way", "time_against_error" or "looking".
+        """
+        from coopenv.viz import figures, style
+
+        check_one_of("unknown figure", kind, KINDS)
+        drawn = KINDS[kind](self, figures.inches_of(width))
+        if isinstance(width, str):
+            figures.restyle(drawn, width)
+        if path is not None:
+            about = {"environment": self.environment, "worlds": self.worlds, "block": self.block}
+            style.save(drawn, Path(path), format or "", about={**about, "agents": ", ".join(self.episodes)})
+        return drawn
+
     def _repr_html_(self) -> str:
-        return terminal_html(self)
+        return terminal_html(self) + picture_html(self.figure())
 
     def __str__(self) -> str:
         return text_of(self, WIDTH)

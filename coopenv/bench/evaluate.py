@@ -21,7 +21,7 @@ from coopenv.base.files import check_new, replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import names_of, version, versions
 from coopenv.base.terminal import Terminal
-from coopenv.bench.cards import Contest, Evaluation
+from coopenv.bench.cards import KINDS, Contest, Evaluation
 from coopenv.evaluation import METRICS, held_out_seeds
 from coopenv.evaluation.episodes import Episodes
 from coopenv.evaluation.metrics import Quantile, interval, resamples
@@ -32,13 +32,11 @@ from coopenv.runs.films import Shot, video_path
 from coopenv.runs.scenes import frame_stride, scene_of, write_page
 from coopenv.scenario import ScenarioLike
 from coopenv.viz import FORMATS, style
-from coopenv.viz.figures import inches_of, restyle
 from coopenv.viz.scene import Origin, SceneRecord
 from coopenv.viz.style import INK, NORMAL, SMALL
 from coopenv.viz.topview import TopView
 
 JSON_FILE = "evaluation.json"
-FIGURES = ("error_along_the_way", "time_against_error", "looking")
 FILMS = ("video.mp4", "video.gif")
 
 
@@ -100,7 +98,7 @@ def run(
     if out is None:
         return driven()
     check_new(out / JSON_FILE, force)
-    names = [JSON_FILE, *(f"{name}.{form}" for name in FIGURES for form in FORMATS), *FILMS, REPLAY_FILE]
+    names = [JSON_FILE, *(f"{name}.{form}" for name in KINDS for form in FORMATS), *FILMS, REPLAY_FILE]
     with replacing_folder(out, [*names, *(path.name for path in out.glob("replay_*.html"))]) as new:
         evaluation = driven()
         replace_text(new / JSON_FILE, json_text(document(evaluation, command)))
@@ -155,14 +153,8 @@ _RAREST = 1e-3
 
 def save_figures(evaluation: Evaluation, folder: Path, file_format: str, width: str | None = None) -> None:
     """Write all figures of an evaluation to a folder, for a page or a column of `coopenv.viz.figures`."""
-    about = {"environment": evaluation.environment, "worlds": evaluation.worlds, "block": evaluation.block}
-    about["agents"] = ", ".join(evaluation.episodes)
-    kinds = {"error_along_the_way": error_figure, "time_against_error": pareto_figure, "looking": looking_figure}
-    for name, draw in kinds.items():
-        figure = draw(evaluation, inches_of(width))
-        if width is not None:
-            restyle(figure, width)
-        style.save(figure, folder / f"{name}.{file_format}", about=about)
+    for name in KINDS:
+        evaluation.figure(name, width=width, path=folder / f"{name}.{file_format}")
 
 
 def error_figure(evaluation: Evaluation, width: float | None = None) -> Figure:
@@ -234,6 +226,9 @@ def looking_figure(evaluation: Evaluation, width: float | None = None) -> Figure
         ax.set_title(look["label"], fontsize=NORMAL, color=INK, pad=6)
         ax.set_xlabel("share of time, log", fontsize=SMALL, color=INK, labelpad=-20)
     return figure
+
+
+KINDS |= {"error_along_the_way": error_figure, "time_against_error": pareto_figure, "looking": looking_figure}
 
 
 def _radius(share: np.ndarray) -> np.ndarray:

@@ -146,19 +146,24 @@ def test_columns_are_in_the_order_of_the_rows() -> None:
     assert table.units == {"way_m": "m", "count": "1"}
 
 
-def test_an_evaluation_in_python(capsys: Any) -> None:
+def test_an_evaluation_in_python(capsys: Any, tmp_path: Path) -> None:
     scenario = coopenv.load_scenario("facade", {"horizon": 3.0})
     found = coopenv.evaluate(scenario, ["peek", "route_follower"], worlds=3)
     assert main(["evaluate", "facade", "--agents", "peek,route_follower", "--worlds", "3", "--set", "horizon=3.0"]) == 0
     printed = capsys.readouterr().out.replace("facade:", "Facade:")
     assert "Facade: 3 held-out worlds" in printed and "e95\n" not in printed
     assert repr(found) == "Evaluation('Facade', agents=('peek', 'route_follower'), worlds=3)"
-    assert "held-out worlds" in found._repr_html_()
+    assert "held-out worlds" in (html := found._repr_html_()) and "data:image/png;base64," in html
+    found.figure("looking", width="ieee1", path=tmp_path / "looking.pdf")
+    assert (tmp_path / "looking.pdf").is_file()
+    with pytest.raises(coopenv.CoopenvError, match=r"unknown figure 'look'.* known: error_along_the_way"):
+        found.figure("look")
     data = found.to_xarray()
     for row in found.rows:
         assert float(data["mean"].sel(agent=row["agent"], metric=row["metric"])) == pytest.approx(
             row["mean"], nan_ok=True
         )
+    assert found.to_pandas().attrs["units"] == {"n": "1"} and not data["mean"].attrs
     assert dict(zip(found.to_pandas().metric, found.to_pandas().unit, strict=True))["e95_m"] == "m"
     with pytest.raises(coopenv.CoopenvError, match=r"^unknown agent 'nosuch'"):
         coopenv.evaluate("facade", "nosuch")
