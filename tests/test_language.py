@@ -13,7 +13,7 @@ GENERATED = (DOCS / "environments", DOCS / "reference" / "api")
 """Pages that `coopenv page` writes, and those that `mkdocstrings` fills."""
 PAGES = {
     page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8")
-    for page in sorted((*ROOT.glob("*.md"), *DOCS.rglob("*.md")))
+    for page in sorted((*ROOT.glob("*.md"), *ROOT.glob("agents/*/card.md"), *DOCS.rglob("*.md")))
     if not any(page.is_relative_to(folder) for folder in GENERATED)
 }
 
