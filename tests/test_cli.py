@@ -45,6 +45,18 @@ def test_list_names_every_environment_on_one_line(capsys: pytest.CaptureFixture[
     assert ["busy_intersection", "5", "3", "prescribed", "50"] in [line.split() for line in lines]
 
 
+@pytest.mark.parametrize("kind", ["envs", "scenes"])
+def test_narrow_lists_are_wrapped_and_not_cut(
+    kind: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["list", kind]) == 0
+    wide = capsys.readouterr().out
+    monkeypatch.setenv("COLUMNS", "40")
+    assert main(["list", kind]) == 0
+    narrow = capsys.readouterr().out
+    assert "…" not in narrow and {*wide.split()} - {*narrow.split()} <= {max(wide.split(), key=len)}  # the rule
+
+
 def test_list_of_observers_and_agents(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "observers"]) == 0
     lines = capsys.readouterr().out.splitlines()[2:]

@@ -15,7 +15,7 @@ from math import inf
 from pathlib import Path
 from time import monotonic, sleep
 
-from coopenv.base.errors import OutputError
+from coopenv.base.errors import OutputError, shown
 from coopenv.base.interrupts import NOTHING, before_a_hard_end, held, note
 
 try:
@@ -149,6 +149,8 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
     Raises:
         OutputError: it cannot be written; the old file is untouched.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise OutputError(f"path: expected text or a Path, got {shown(path)}")
     with _staging(path, _check_file) as (place, part):
         new = part / place.name
         with writing(path):

@@ -104,6 +104,8 @@ def scenario_path(name_or_path: str | Path) -> Path:
         found = f"{path}: a ROS bag is no scenario; it runs with a map of its topics: coopenv run BAG --map topics.toml"
     elif path.is_dir():
         found = f"{short}: a folder; {EXPECTED}; coopenv view opens that of a run"
+    elif there and path.suffix == ".zip":
+        found = f"{short}: a run as one file, which alone `coopenv run` plays again"
     elif not there:
         near = suggest(path.stem, names) or ("" if path.suffix == ".toml" else f"; {EXPECTED}")
         found = f"no such scenario file: {short}{near}"

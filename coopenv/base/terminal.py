@@ -31,10 +31,11 @@ class Terminal(Console):
 
 
 class NumberTable(Table):
-    """A table that takes the width that it needs."""
+    """A table that takes the width that it needs: at least that of its longest words, where texts may be wrapped."""
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        needed = self.__rich_measure__(console, options.update(max_width=10_000)).maximum
+        width = self.__rich_measure__(console, options.update(max_width=10_000))
+        needed = width.maximum if all(column.no_wrap for column in self.columns) else width.minimum
         return super().__rich_console__(console, options.update(max_width=max(options.max_width, needed)))
 
 

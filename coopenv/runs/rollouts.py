@@ -12,7 +12,7 @@ import warp as wp
 from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
 from coopenv.backends.base import EPISODE_OVER, Backend
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import CoopenvError, explained
 from coopenv.base.installation import version
 from coopenv.estimation import Outcome, Sight
 from coopenv.estimation.metrics import CONVERGED, mean_targets_in_view, observability_of, steady_mean, summarise
@@ -144,6 +144,7 @@ class Rollout:
         return [Ending(words[outcome], time) for outcome, time in zip(ended[-1].tolist(), times, strict=True)]
 
 
+@explained
 def rollout(
     scenario: ScenarioLike,
     seed: int = 0,
@@ -152,6 +153,8 @@ def rollout(
     device: str = "cpu",
     policy: str | Policy = "zero",
     on_tick: Callable[[Engine, int], None] | None = None,
+    *,
+    overrides: Mapping[str, Any] | None = None,
 ) -> Trajectory:
     """Run one episode and return its record, every camera tick from t = 0.
 
@@ -166,11 +169,12 @@ def rollout(
         policy: "zero", "random", or what `find_agent` takes, such as a function of the observations (N, D) that returns
             actions (N, A); vehicles with prescribed motion ignore their actions.
         on_tick: called with the engine and the tick's number after every tick, 0 included.
+        overrides: dotted scenario keys.
 
     Raises:
         CoopenvError: an argument is not valid.
     """
-    run = Rollout(load_scenario(scenario), seed, steps, dtype, device, policy)
+    run = Rollout(load_scenario(scenario, overrides), seed, steps, dtype, device, policy)
     for tick in run.play():
         if on_tick is not None:
             on_tick(run.engine, tick)

@@ -16,6 +16,7 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import listed
 from coopenv.base.format import number
 from coopenv.base.installation import environment_id, list_agents, list_envs
+from coopenv.base.terminal import NumberTable
 from coopenv.observers.registry import description, list_observers
 from coopenv.policies import find_agent
 from coopenv.runs import scenario_text
@@ -311,11 +312,12 @@ def _sentence(text: str) -> str:
 
 def list_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Table:
     """Return one row per entry; texts of the last column that do not fit into the width are wrapped."""
-    table = Table(box=box.HORIZONTALS, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
+    table = NumberTable(box=box.HORIZONTALS, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
     for key in columns:
         heading = key.removesuffix("_s") + (" [s]" if key.endswith("_s") else "")
         number = bool(rows) and isinstance(rows[0][key], int | float)
-        table.add_column(heading, justify="right" if number else "left", no_wrap=key != columns[-1])
+        whole = 0 if key == columns[-1] else max((len(cell_text(row[key])) for row in rows), default=0)
+        table.add_column(heading, justify="right" if number else "left", no_wrap=whole > 0, min_width=whole)
     for row in rows:
         table.add_row(*(cell_text(row[key]) for key in columns))
     return table

@@ -94,6 +94,15 @@ class Scenario(Section, metaclass=_Loaded):
         """Return the names of the sections and values, for `dict(scenario)` and `{**scenario}`."""
         return type(self).model_fields.keys()
 
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Return a copy, its entries checked again where an update changes some.
+
+        Raises:
+            ScenarioError: the update does not describe a possible world.
+        """
+        own = {} if update is None else {name: getattr(self, name) for name in self.model_fields_set}
+        return type(self)(**{**own, **update}) if update else super().model_copy(deep=deep)
+
     @property
     def facts(self) -> dict[str, object]:
         """The main figures: of vehicles and landmarks, the observer's name, and the length, s."""

@@ -18,6 +18,7 @@ import pytest
 import coopenv
 from coopenv.api.arguments import Info
 from coopenv.base.errors import Explained
+from coopenv.base.files import replace_text
 from coopenv.cli import main
 from coopenv.runs import record, rollout
 from coopenv.scenario import Scenario
@@ -50,6 +51,7 @@ def test_whatever_stands_for_a_scenario_goes_everywhere(scenario: Scenario, kind
         np.testing.assert_array_equal(rows[0], observations["vehicle_1"])
         assert env.scenario == batch.scenario == scenario
     np.testing.assert_array_equal(rollout(given, seed=4).position, coopenv.run(given, seed=4).trajectory.position)
+    assert rollout(given, overrides={"horizon": 0.2}).t[-1] == pytest.approx(0.2)
     assert len(record(given, seed=4).t) == 1 + scenario.horizon_ticks
     if kind == "dict":
         assert coopenv.compare(["dead_reckoning"], given, seeds=1).environment == "Facade"
@@ -217,6 +219,13 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "a constructor": (lambda: Scenario(title="Mine"), r"^Scenario: horizon: Field required"),  # type: ignore[call-arg]
     "a replaced entry": (lambda: coopenv.load_scenario(ENV).__replace__(horizon=-3.0), "greater than 0"),
     "a file of another kind": (lambda: coopenv.run("x.zip"), r"^no such scenario file: x\.zip; expected a scenario "),
+    "a run as one file": (lambda: coopenv.parallel_env("drive.zip"), r"^drive\.zip: a run as one file, which alone"),
+    "a number as path": (lambda: replace_text(5, ""), "^path: expected text or a Path, got 5$"),  # type: ignore[arg-type]
+    "an unchecked copy": (
+        lambda: coopenv.load_scenario(ENV).model_copy(update={"horizon": -3}),
+        "horizon: Input should be greater than 0, got -3",
+    ),
+    "a copy with a typo": (lambda: coopenv.load_scenario(ENV).model_copy(update={"horizn": 3}), "mean 'horizon'"),
     "two observers": (lambda: coopenv.run(ENV, observer="mekf,robust"), r"one at a time; several: coopenv\.compare$"),
     "a missing model": (
         lambda: coopenv.evaluate(ENV, "a.zip"),
@@ -254,7 +263,10 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_one_line(mistake: str) -> None:
+def test_a_mistake_is_one_line(mistake: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if mistake == "a run as one file":
+        monkeypatch.chdir(tmp_path)
+        Path("drive.zip").touch()
     attempt, words = MISTAKES[mistake]
     with pytest.raises(coopenv.CoopenvError, match=words) as caught:
         attempt()

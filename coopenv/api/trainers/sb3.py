@@ -209,6 +209,8 @@ def make_sb3_vec_env(name_or_path: ScenarioLike, *, seed: int | None = None, **o
     Raises:
         CoopenvError: any argument is not valid.
     """
+    if isinstance(name_or_path, CooperativeVectorEnv):
+        raise CoopenvError("make_sb3_vec_env takes what make_vec takes; of a batch: CooperativeSB3VecEnv(batch)")
     for name in ("autoreset", "arrays"):
         if name in options:
             raise CoopenvError(f"make_sb3_vec_env chooses {name} itself: SB3 resets in the same step and takes NumPy")
