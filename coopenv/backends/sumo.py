@@ -154,6 +154,8 @@ class Sumo(TrafficProgram):
         self._step(moved[self._taken | gone])
 
     def _step(self, moved: Array) -> None:
+        if self._process is None:
+            raise CoopenvError("SUMO is not running: reset() starts it")
         self._moved.append(moved)
         rows = [[int(i), *(None if np.isnan(x) else float(x) for x in row)] for i, *row in moved]
         self._ask({"do": "step", "moved": rows})
@@ -214,12 +216,11 @@ class Sumo(TrafficProgram):
         process, at = self._process, len(self._moved) / self._scenario.rates.camera
         status = None if why or process is None else process.wait(PATIENCE)
         self._errors.seek(0)
-        lines = self._errors.read().decode(errors="replace").splitlines()
-        errors = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
+        _, said, error = self._errors.read().decode(errors="replace").rpartition("Error: ")
         self.close()
         if status is not None and status < 0:
             raise CoopenvError(f"SUMO was ended by {signal.Signals(-status).name} {at:g} s after the reset")
-        reason = " ".join((errors or [why or f"it ended with status {status}"])[-1].split())
+        reason = " ".join((error if said else why or f"it ended with status {status}").split())
         raise CoopenvError(f"SUMO, {at:g} s after the reset: {shortened(reason, 300)}")
 
     def save(self) -> dict[str, Any]:
@@ -263,9 +264,8 @@ def _end(process: subprocess.Popen[bytes], errors: IO[bytes]) -> None:
 
 
 def _option(value: Any) -> str:
-    if isinstance(value, tuple):
-        return ",".join(map(str, value))
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    given = value if isinstance(value, tuple) else (value,)
+    return ",".join(str(x).lower() if isinstance(x, bool) else str(x) for x in given)
 
 
 def _direction(heading: Array) -> Array:

@@ -189,27 +189,27 @@ def one_line(error: ValidationError, where: str, model: type[BaseModel]) -> str:
     loc, unknown = first["loc"], first["type"] == "extra_forbidden"
     keys = [k for i, k in enumerate(loc, 1) if isinstance(k, int) or k.isidentifier() or (unknown and i == len(loc))]
     field = ".".join(shortened(str(part)) for part in keys)
+    where = f"{where}: {field}" if field else where
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
     if unknown:
         valid = _valid_keys(loc[:-1], model)
         several = sum(detail["type"] == "extra_forbidden" for detail in details) > 2  # it is another kind of file
         hint = (not several and suggest(str(keys[-1]), valid)) or f"; allowed: {', '.join(valid)}"
-        return f"{where}: {field}: unknown key{hint}{more}"
+        return f"{where}: unknown key{hint}{more}"
     if first["type"] in ("union_tag_not_found", "union_tag_invalid"):
-        return f"{where}: {field}.{_kind_message(first)}{more}"
-    message = (
-        first["msg"].removeprefix("Value error, ").replace("valid tuple", "list").replace("Tuple should", "List should")
-    )
+        return f"{where}.{_kind_message(first)}{more}"
+    message = first["msg"].removeprefix("Value error, ").replace("Tuple should", "List should")
+    message = re.sub("a valid dictionary( or instance of .*)?", "an object", message).replace("valid tuple", "list")
     if first["type"] == "missing" and isinstance(keys[-1], int):
-        return f"{where}: {field.rpartition('.')[0]}: too few entries, number {keys[-1] + 1} is missing{more}"
+        return f"{where.rpartition('.')[0]}: too few entries, number {keys[-1] + 1} is missing{more}"
     if first["type"] == "value_error":  # our own checks: their messages start with the field that they are about
-        joint = "." if re.match(r"[^\W\d][\w.]*:", message) else ": "
-        return f"{where}: {field}{joint if field else ''}{message}{more}"
+        joint = "." if field and re.match(r"[^\W\d][\w.]*:", message) else ": "
+        return f"{where}{joint}{message}{more}"
     if first["type"] == "json_invalid":
         return f"{where}: {TOO_DEEP if 'recursion' in message else message}"
     got = first.get("input")
     given = f", got {shown(got)}" if isinstance(got, bool | int | float | str) else ""
-    return f"{where}: {field}: {message}{given}{more}"
+    return f"{where}: {message}{given}{more}"
 
 
 def _kind_message(detail: Any) -> str:

@@ -165,7 +165,7 @@ def with_sumo(raw: Any) -> Any:
     except (TypeError, ValueError):
         return raw
     lists = [raw.get(key, []) for key in ("landmarks", "obstacles", "routes", "vehicles", "roads")]
-    if made.included or not all(isinstance(given, list) for given in lists):
+    if (made.included and "landmarks" in raw) or not all(isinstance(given, list) for given in lists):
         return raw
     landmarks, obstacles, routes, vehicles, roads = lists
     network = _read_network(made)
@@ -173,7 +173,8 @@ def with_sumo(raw: Any) -> Any:
     wanted = {name for v in vehicles if isinstance(v, Mapping) for name in _names(v.get("routes"))}
     wanted -= {route.get("name") for route in routes if isinstance(route, Mapping)}
     edges = route_edges(made) if wanted else {}
-    ways = [_route(network, name, edges[name]) for name in sorted(wanted & edges.keys())]
+    with _reading(Path(made.net), "sumo.net"):
+        ways = [_route(network, name, edges[name]) for name in sorted(wanted & edges.keys())]
     return {
         **raw,
         "map": raw.get("map", {"origin": [*network.center, 0.0]}),
@@ -211,6 +212,8 @@ def _network(path: Path, modified: int) -> Network:
             if element.get("function") == "internal":
                 found.inner.update({x.attrib["id"]: s for x, (s, _) in zip(element.iter("lane"), lanes, strict=True)})
             elif element.get("function", "normal") == "normal":
+                if min((len(shape) for shape, _ in lanes), default=0) < 2:
+                    raise ValueError(f"edge {shown(element.attrib['id'])} needs lanes of two points or more")
                 found.lanes[element.attrib["id"]] = lanes
                 found.goes_to[element.attrib["id"]] = element.attrib["to"]
         elif element.tag == "junction" and element.get("type") == "dead_end":
@@ -241,20 +244,23 @@ def _reading(path: Path, key: str) -> Iterator[None]:
         raise ScenarioError(f"{key}: {shown(str(path))}: {error.strerror or error}") from None
     except (ParseError, EOFError, zlib.error) as error:
         raise ScenarioError(f"{key}: {path.name}: not XML: {error}") from None
+    except ScenarioError:
+        raise
     except (KeyError, ValueError, IndexError) as error:
         raise ScenarioError(f"{key}: {path.name}: an element lacks or spoils an attribute: {error}") from None
 
 
 def _shape(text: str) -> Shape:
-    return np.array([[float(x) for x in point.split(",")[:2]] for point in text.split()]).reshape(-1, 2)
+    """Return the points of a text, without those that repeat the one before."""
+    points = np.array([[float(x) for x in point.split(",")[:2]] for point in text.split()]).reshape(-1, 2)
+    return points[np.append(True, np.diff(points, axis=0).any(axis=1))[: len(points)]]
 
 
 def _roads(network: Network) -> Iterator[dict[str, Any]]:
     for lanes in network.lanes.values():
         for shape, width in lanes:
             for a, b in pairwise(shape.tolist()):
-                if a != b:
-                    yield {"start": a, "end": b, "width": width, "marked": False}
+                yield {"start": a, "end": b, "width": width, "marked": False}
 
 
 def _posts(network: Network, height: float) -> Iterator[dict[str, Any]]:
@@ -342,9 +348,13 @@ def _route(network: Network, name: str, edges: Sequence[str]) -> dict[str, Any]:
             raise ScenarioError(f"sumo.routes: route {shown(name)}: no way from edge {shown(here)} to {shown(there)}")
         start, end, via = min(turns, key=lambda turn: abs(turn[0] - lane))
         parts += [network.lanes[here][start][0]]
+        passed: dict[str, Shape] = {}
         while via:
-            parts.append(network.inner[via])
+            if via in passed:
+                raise ValueError(f"lane {shown(via)} leads to itself")
+            passed[via] = network.inner[via]
             via = next((v for _, _, v in network.turns.get((via.rpartition("_")[0], there), ())), "")
+        parts += passed.values()
         lane = end
     points = np.concatenate(parts).round(2)
     apart = np.hypot(*np.diff(points, axis=0).T) > 0.1

@@ -8,9 +8,9 @@ buildings, signs, signals and routes.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from coopenv.base.errors import ScenarioError
 from coopenv.base.sections import NonNegative, Positive, PositiveVector2, Section, validated
@@ -190,6 +190,14 @@ class Streets(Section):
     """From one green time to the next, s."""
     lateral_spread: NonNegative = 0.2
     """Of the routes, m."""
+
+    @model_validator(mode="after")
+    def _is_possible(self) -> Self:
+        if self.clearance >= self.period / 2:
+            raise ValueError(f"clearance: {self.clearance:g} s must be below half the period, {self.period / 2:g} s")
+        if self.sign_height[1] > self.height:
+            raise ValueError(f"sign_height: {self.sign_height[1]:g} m is above the `height`, {self.height:g} m")
+        return self
 
 
 def with_streets(raw: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -219,6 +219,10 @@ def test_what_a_scenario_takes_from_files_of_sumo(tmp_path: Path) -> None:
     }
     again = coopenv.scenario.parse_scenario(found.model_dump(mode="json", exclude_unset=True), "corner")
     assert again == found
+    raw = sumo_scenario(tmp_path)
+    del raw["landmarks"]
+    raw["sumo"]["included"] = True
+    assert len(coopenv.scenario.parse_scenario(raw, "corner").landmarks) == 2, "a file without landmarks includes none"
 
 
 @pytest.mark.parametrize(
@@ -227,6 +231,20 @@ def test_what_a_scenario_takes_from_files_of_sumo(tmp_path: Path) -> None:
         ("a.net.xml", "<net>", r"sumo\.net: a\.net\.xml: not XML"),
         ("a.net.xml", "<routes/>", r"sumo\.net: a\.net\.xml: no roads in it; expected a network"),
         ("a.net.xml", NET.replace('id="in" ', ""), r"sumo\.net: a\.net\.xml: an element lacks or spoils an attribute"),
+        (
+            "a.net.xml",
+            NET.replace("</net>", '<edge id="x" from="A" to="J"/></net>'),
+            r"a\.net\.xml: .*edge 'x' needs lanes of two",
+        ),
+        ("a.net.xml", NET.replace("0,10 50,10", "50,10"), r"a\.net\.xml: .*edge 'in' needs lanes of two"),
+        ("a.net.xml", NET.replace("0,10 50,10", ""), r"a\.net\.xml: .*edge 'in' needs lanes of two"),
+        ("a.net.xml", NET.replace("0,10 50,10", "50,10 50,10"), r"a\.net\.xml: .*edge 'in' needs lanes of two"),
+        ("a.net.xml", NET.replace('via=":J_0_0"', 'via=":K_0"'), r"sumo\.net: a\.net\.xml: .*':K_0'"),
+        (
+            "a.net.xml",
+            NET.replace('toLane="0" dir="l" state="M"', 'toLane="0" via=":J_0_0" dir="l"'),
+            r"sumo\.net: a\.net\.xml: .*lane ':J_0_0' leads to itself",
+        ),
         ("a.add.xml", SHAPES.replace('x="20" ', 'lon="2" '), r"sumo\.additional: a\.add\.xml: an element lacks"),
         ("a.add.xml", SHAPES.replace("in out", "in off"), r"sumo\.routes: route 'way': the network has no edge 'off'"),
         ("a.add.xml", SHAPES.replace("in out", "out in"), r"sumo\.routes: route 'way': no way from edge 'out' to 'in'"),

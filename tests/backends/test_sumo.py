@@ -199,6 +199,8 @@ def test_the_end_of_sumo_is_one_line_and_the_next_reset_begins_anew() -> None:
     process = env.engine.world.programs[0]._process
     env.close()
     assert process.poll() is not None
+    with pytest.raises(CoopenvError, match=r"^SUMO is not running: reset\(\) starts it$"):
+        env.step({agent: np.zeros(2) for agent in env.agents})
 
 
 def test_its_process_ends_with_the_program_that_has_started_it() -> None:
@@ -223,6 +225,7 @@ def test_its_process_ends_with_the_program_that_has_started_it() -> None:
         ({"sumo.nets": "a"}, r"sumo\.nets: unknown key \(did you mean 'net'\?\)"),
         ({"sumo.options": {"step-length": 0.05}}, r"options\.step-length: follows from rates\.camera; leave this out"),
         ({"sumo.options": {"no-such-option": 1}}, "SUMO, 0 s after the reset: .*no-such-option"),
+        ({"sumo.options": {"scale": [1, 2]}}, r"'scale': '1\.0,2\.0' is not a valid float"),
         ({"rates.camera": 60.0, "rates.decision": 5.0}, r"rates\.camera: SUMO steps in whole milliseconds, not in 16"),
         ({"vehicles.6.routes": ["south_nort"]}, r"vehicles\.6\.routes: unknown route 'south_nort'; known: west_east"),
         ({"vehicles.6.routes": ["south_north", "west_east"]}, r"vehicles\.6: SUMO needs one of its routes"),
