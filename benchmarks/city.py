@@ -24,14 +24,15 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.machine import machine
+from benchmarks.speed.__main__ import positive
 from coopenv import EVALUATION_SEEDS, load_scenario
 from coopenv.api.engine import Engine
-from coopenv.base.errors import ScenarioWarning, world_keys
+from coopenv.base.errors import CoopenvError, ScenarioWarning, check_one_of, world_keys
 from coopenv.base.files import replace_text
 from coopenv.base.format import in_parentheses, json_text
 from coopenv.base.installation import version
 from coopenv.bench.pages import fingerprint
-from coopenv.observers.registry import find_embedded
+from coopenv.observers.registry import find_embedded, list_observers
 from coopenv.runs.console import Progress
 from coopenv.scenario import Scenario
 from coopenv.viz import style
@@ -306,11 +307,11 @@ def draw(studies: Sequence[dict[str, Any]], sizes: Sequence[dict[str, Any]], pat
     style.save(figure, path)
 
 
-def measure(observers: Sequence[str], worlds: int, sizes: Sequence[str]) -> dict[str, Any]:
-    """Return what is found of observers, in so many worlds, and of sizes; empty names are left out."""
+def measure(observers: Sequence[str], worlds: int, sizes: Sequence[int]) -> dict[str, Any]:
+    """Return what is found of observers, in so many worlds, and of sizes."""
     seeds = [EVALUATION_SEEDS[k] for k in range(worlds)]
-    jobs: list[tuple[Any, ...]] = [(study, name, seeds) for name in observers if name]
-    jobs += [(growth, name, int(size), seeds[0]) for name in ("riccati", "robust") for size in sizes if size]
+    jobs: list[tuple[Any, ...]] = [(study, name, seeds) for name in observers]
+    jobs += [(growth, name, size, seeds[0]) for name in ("riccati", "robust") for size in sizes]
     results: dict[str, Any] = {"machine": machine(), "worlds": worlds, "observers": [], "sizes": []}
     with Progress(Console(stderr=True), "city", total=len(jobs)) as progress:
         for done, (job, *given) in enumerate(jobs):
@@ -343,22 +344,35 @@ def report(results: dict[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
+def numbers(text: str) -> list[int]:
+    """Return numbers with commas between."""
+    return [positive(int)(part) for part in text.split(",") if part]
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, and write the results; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.city", description=__doc__)
     parser.add_argument("--observers", default=",".join(OBSERVERS), help="names with commas between; empty: none")
-    parser.add_argument("--worlds", type=int, default=4, help="worlds per observer (default: 4)")
-    parser.add_argument("--sizes", default=",".join(map(str, SIZES)), help="numbers of vehicles; empty: none")
+    parser.add_argument("--worlds", type=positive(int), default=4, help="worlds per observer (default: 4)")
+    parser.add_argument("--sizes", type=numbers, default=list(SIZES), help="of vehicles, likewise")
     parser.add_argument("--out", type=Path, default=Path("out", "city"), help="folder (default: out/city)")
     parser.add_argument("--page", type=Path, help="folder of the environments' pages: nothing is measured")
     asked = parser.parse_args(arguments)
-    asked.out.mkdir(parents=True, exist_ok=True)
-    file = asked.out / "city.json"
-    if asked.page:
-        results = json.loads(file.read_text(encoding="utf-8"))
-    else:
-        results = measure(asked.observers.split(","), asked.worlds, asked.sizes.split(","))
-        replace_text(file, json_text(results))
+    file, observers = asked.out / "city.json", [name for name in asked.observers.split(",") if name]
+    try:
+        for name in observers:
+            check_one_of("--observers: unknown observer", name, list_observers())
+        if asked.page:
+            if not file.is_file():
+                raise CoopenvError(f"--page: no {file}; without --page the command measures it")
+            results = json.loads(file.read_text(encoding="utf-8"))
+        else:
+            asked.out.mkdir(parents=True, exist_ok=True)
+            results = measure(observers, asked.worlds, asked.sizes)
+            replace_text(file, json_text(results))
+    except (CoopenvError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     text = report(results)
     print(text)
     if asked.page:

@@ -14,6 +14,7 @@ from typing import Any
 from benchmarks.gpu.plan import SIZES, Stage, plan
 from benchmarks.gpu.runner import failures, run
 from benchmarks.gpu.table import put, section
+from benchmarks.speed.__main__ import positive
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import check_file, writing
 from coopenv.base.installation import version
@@ -32,7 +33,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parser().parse_args(words)
     try:
         if asked.table:
-            put(json.loads(asked.table.read_text(encoding="utf-8")), asked.page)
+            try:
+                put(json.loads(asked.table.read_text(encoding="utf-8")), asked.page)
+            except (json.JSONDecodeError, UnicodeDecodeError, LookupError, TypeError, AttributeError):
+                raise CoopenvError(f"--table: {asked.table}: expected a JSON file that make gpu has written") from None
             print(f"{asked.page}: holds the figures of {asked.table}")
             return 0
         device = check_device(asked.device)
@@ -73,8 +77,12 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     found = argparse.ArgumentParser(prog="python -m benchmarks.gpu", description=__doc__)
     found.add_argument("--device", default="cuda:0", help="cuda:0, ...; cpu tries the run itself (default: cuda:0)")
-    found.add_argument("--worlds", type=int, nargs="+", default=list(SIZES), help="whose throughput is measured")
-    found.add_argument("--minutes", type=float, default=MINUTES, help=f"for everything (default: {MINUTES:g})")
+    found.add_argument(
+        "--worlds", type=positive(int), nargs="+", default=list(SIZES), help="whose throughput is measured"
+    )
+    found.add_argument(
+        "--minutes", type=positive(float), default=MINUTES, help=f"for everything (default: {MINUTES:g})"
+    )
     found.add_argument("--only", default="", metavar="START", help="stages whose names begin so, such as throughput")
     found.add_argument("--code", type=Path, default=Path("out", "cuda"), help="of make cuda-check (default: out/cuda)")
     found.add_argument("--quick", action="store_true", help="as little as possible of everything")

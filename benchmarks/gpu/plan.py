@@ -7,6 +7,8 @@ from typing import Any
 
 SENSED = {"topology.mode": "sensed"}
 ENVIRONMENT, TRAINED, LEARNING = "busy_intersection", "urban_crossing", "open_square"
+CITY = {"streets.blocks": [19, 19], "vehicles.0.count": 922, "vehicles.1.count": 102}
+"""1,024 vehicles in a world, at the density of the shipped city."""
 OBSERVERS = ("riccati", "robust")
 SIZES = (4_096, 16_384, 65_536, 262_144)
 
@@ -45,6 +47,8 @@ def plan(device: str, sizes: tuple[int, ...] = SIZES, quick: bool = False) -> li
         drawn = {**world, **pace, "environment": LEARNING, "overrides": {"observer.name": observer}}
         name = f"throughput, {observer} in {LEARNING}, {sizes[0]}"
         stages.append(Stage(name, "throughput", 60.0, {**drawn, "worlds": sizes[0]}))
+        large = {**drawn, "environment": "city", "overrides": {**({} if quick else CITY), "observer.name": observer}}
+        stages.append(Stage(f"throughput, {observer} in city, 1", "throughput", 90.0, {**large, "worlds": 1}))
         stages.append(
             Stage(f"compile, {observer}, float64", "compile_kernels", compiling, {**world, "dtype": "float64"})
         )

@@ -22,6 +22,7 @@ from benchmarks.stages.__main__ import main as stages_main
 from benchmarks.stages.ablated_stages import NEVER, STAGES, Setting, ablated_settings
 from benchmarks.stages.against import HERE
 from benchmarks.stages.rounds import alternate
+from coopenv import load_scenario
 from coopenv.base.errors import CoopenvError
 from tests.helpers.commands import refused
 
@@ -68,6 +69,15 @@ def test_worlds_that_do_not_fit_are_left_out(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(work, "free_memory", lambda device: 10 * 2**20)
     (stage,) = (s for s in plan("cpu", (1000,)) if s.name == "throughput, riccati, 1000")
     assert work.throughput(**stage.arguments)["skipped"].startswith("1000 worlds take 0.0 GiB")
+
+
+def test_one_large_world_is_a_stage_of_its_own() -> None:
+    (stage,) = (s for s in plan("cpu") if s.name.startswith("throughput, riccati in city"))
+    given = stage.arguments
+    assert given["worlds"] == 1 and len(load_scenario(given["environment"], given["overrides"]).vehicles) == 1_024
+    (quick,) = (s for s in plan("cpu", quick=True) if s.name == stage.name)
+    found = work.throughput(**quick.arguments)
+    assert found["worlds"] == 1 and found["vehicle_ticks_per_s"] > 0.0
 
 
 def test_worlds_are_compared_one_by_one() -> None:
@@ -134,14 +144,21 @@ def test_a_torch_that_is_there_is_not_installed_again() -> None:
     assert {line.partition(">")[0] for line in with_it} >= {"warp-lang", "numpy", "tyro", "tensorboard", "pytest"}
 
 
-def test_mistakes_are_one_line(tmp_path: Path) -> None:
+def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").touch()
+    (tmp_path / "stages.json").write_text(json.dumps({**HEAD, "stages": [{}]}))
     for arguments, words in (
         (["--device", "tpu"], "unknown device 'tpu'"),
         (["--device", "cpu", "--out", str(tmp_path / "file" / "gpu.json")], "cannot write to"),
         (["--table", str(tmp_path / "none.json")], "none.json"),
+        (["--table", str(tmp_path / "file")], "file: expected a JSON file that make gpu has written"),
+        (["--table", str(tmp_path / "stages.json")], "stages.json: expected a JSON file that make gpu has written"),
     ):
         assert words in refused(*arguments, command=main)
+    for wrong in (["--worlds", "0"], ["--minutes", "nan"]):
+        with pytest.raises(SystemExit):
+            main(wrong)
+        assert f"{wrong[0]}: expected a positive number, got {wrong[1]}" in capsys.readouterr().err
 
 
 @pytest.mark.slow
