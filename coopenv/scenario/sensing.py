@@ -202,7 +202,7 @@ class Topology(Section):
     most_nearby: int | None = Field(default=None, ge=1, le=4_096)
     """Most landmarks and vehicles within the ranges of a vehicle's camera and radio, or in its list of neighbours, for
     scenes of hundreds of vehicles (none: no limit). Time and memory then grow with the number of vehicles, not with its
-    square; the group `map` of observations still looks at all landmarks."""
+    square; with map errors, the group `map` of observations looks at all landmarks."""
 
 
 class V2x(Section):
