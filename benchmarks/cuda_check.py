@@ -25,9 +25,10 @@ from typing import Any
 
 import warp as wp
 
+from benchmarks.speed.__main__ import positive
 from coopenv.api.engine import Engine
 from coopenv.backends.feed import COSIMULATED, RECORDED
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.files import replace_text
 from coopenv.base.format import json_text
 from coopenv.bench.pages import table
@@ -187,16 +188,17 @@ def beyond(rows: Rows, allowed: dict[str, dict[str, int]]) -> list[str]:
 
 
 def accept(rows: Rows) -> None:
-    """Write the limits that rows of all modules need, with room; a thread has 255 registers at most."""
-    lines = [",".join(("module", *NEEDS))]
-    for name in sorted({row["module"] for row in rows}):
+    """Write the limits that the modules of rows need, with room; a thread has 255 registers at most."""
+    allowed = limits()
+    for name in {row["module"] for row in rows}:
         most = {need: max(row[need] for row in rows if row["module"] == name) for need in NEEDS}
         room = {need: round(ROOM * most[need]) for need in NEEDS}
         room["registers"] = min(255, most["registers"] + REGISTERS)
         if most["stack"] < STACK:
             room["stack"] = min(room["stack"], STACK - 1)
-        lines.append(",".join((name, *(str(room[need]) for need in NEEDS))))
-    replace_text(LIMITS, "\n".join(lines) + "\n")
+        allowed[name] = room
+    lines = [("module", *NEEDS), *((name, *map(str, room.values())) for name, room in sorted(allowed.items()))]
+    replace_text(LIMITS, "".join(f"{','.join(line)}\n" for line in lines))
 
 
 def report(rows: Rows) -> str:
@@ -211,9 +213,13 @@ def report(rows: Rows) -> str:
 
 
 def put(rows: Rows, page: Path) -> None:
-    """Put the table into a page between its two marks."""
+    """Put the table into a page between its two marks; rows of other modules stay."""
     before, _, rest = page.read_text(encoding="utf-8").partition(BEGIN)
-    replace_text(page, f"{before}{BEGIN}\n\n{report(rows)}\n\n{END}{rest.partition(END)[2]}")
+    old, _, after = rest.partition(END)
+    head, rule, *new = report(rows).splitlines()
+    lines = {line.split("`")[1]: line for line in (*old.splitlines(), *new) if line.startswith("| `")}
+    text = "\n".join([head, rule, *(line for _, line in sorted(lines.items()))])
+    replace_text(page, f"{before}{BEGIN}\n\n{text}\n\n{END}{after}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -222,16 +228,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.simplefilter("ignore")
     rows: Rows = []
     try:
-        modules = {name: m for p in asked.dtype for name, m in catalogue(p).items() if re.search(asked.only, name)}
+        if asked.accept and (len({*asked.dtype}), len({*asked.arch})) != (len(PRECISIONS), len(ARCHITECTURES)):
+            raise CoopenvError("--accept needs both precisions and all architectures: leave out --dtype and --arch")
+        modules = {name: m for p in asked.dtype for name, m in catalogue(p).items() if asked.only.search(name)}
         if not modules:
-            raise CoopenvError(f"--only: no module has '{asked.only}' in its name")
+            raise CoopenvError(f"--only: no module has '{asked.only.pattern}' in its name")
         cache = asked.out / wp.config.version  # as Warp makes it of WARP_CACHE_PATH
         for found in check(modules.values(), cache, asked.arch, asked.jobs):
             rows += found
             print(f"{found[0]['module']}: " + "; ".join(_line(row) for row in found), flush=True)
-        whole = asked.only == "" and list(asked.dtype) == list(PRECISIONS)
-        if asked.accept and not whole:
-            raise CoopenvError("--accept needs all modules: leave out --only and --dtype")
         if asked.accept:
             accept(rows)
             put(rows, PAGE)
@@ -250,15 +255,25 @@ def _line(row: dict[str, Any]) -> str:
     return f"sm_{row['arch']} {row['registers']} registers, {row['stack']} B of stack, {row['spills']} B of spills"
 
 
+def pattern(text: str) -> re.Pattern[str]:
+    """Return a regular expression."""
+    try:
+        return re.compile(text)
+    except re.error as error:
+        raise argparse.ArgumentTypeError(f"expected a regular expression, got {shown(text)}: {error}") from None
+
+
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     found = argparse.ArgumentParser(prog="python -m benchmarks.cuda_check", description=__doc__)
     found.add_argument("--arch", type=int, nargs="+", default=list(ARCHITECTURES), choices=ARCHITECTURES)
     found.add_argument("--dtype", nargs="+", default=list(PRECISIONS), choices=PRECISIONS)
-    found.add_argument("--only", default="", metavar="PATTERN", help="modules whose names match a regular expression")
+    found.add_argument(
+        "--only", type=pattern, default="", metavar="PATTERN", help="modules whose names match a regular expression"
+    )
     found.add_argument("--out", type=Path, default=Path("out", "cuda"), help="folder of the code (default: out/cuda)")
-    found.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="modules at a time (default: all cores)")
-    found.add_argument("--accept", action="store_true", help="make the limits and the page's table of this run")
+    found.add_argument("--jobs", type=positive(int), default=os.cpu_count() or 1, help="modules at a time")
+    found.add_argument("--accept", action="store_true", help="make limits, and rows of the page's table, of this run")
     return found
 
 

@@ -94,7 +94,7 @@ LINES_AND_FILES = {
     "cli": (2666, 8),
     "estimation": (1888, 7),
     "evaluation": (495, 3),
-    "observers": (11723, 42),
+    "observers": (11725, 42),
     "policies": (2075, 10),
     "runs": (3523, 13),
     "scenario": (3710, 12),

@@ -12,7 +12,21 @@ from typing import Any
 import pytest
 import warp as wp
 
-from benchmarks.cuda_check import PRECISIONS, STACK, assembler, beyond, catalogue, check_module, limits, main, parsed
+from benchmarks.cuda_check import (
+    BEGIN,
+    END,
+    PRECISIONS,
+    STACK,
+    accept,
+    assembler,
+    beyond,
+    catalogue,
+    check_module,
+    limits,
+    main,
+    parsed,
+    put,
+)
 from coopenv.base.errors import CoopenvError
 from coopenv.observers.registry import ZOO
 
@@ -86,6 +100,24 @@ def test_what_is_above_a_limit_is_a_line() -> None:
     assert beyond([row, row], {}) == ["a: no limits in cuda_limits.csv"]
 
 
+def test_rows_of_a_part_replace_their_own_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page, csv = tmp_path / "page.md", tmp_path / "limits.csv"
+    csv.write_text("module,ptx_bytes,registers,stack,spills\nb.float32,1,2,3,4\nc.float32,1,2,3,4\n")
+    monkeypatch.setattr("benchmarks.cuda_check.LIMITS", csv)
+    page.write_text(f"above\n{BEGIN}\n\n| module | x |\n|---|---|\n| `b` | 9 |\n| `c` | 9 |\n\n{END}\nbelow\n")
+    needs = {"ptx_bytes": 100, "registers": 250, "stack": 2000, "spills": 8}
+    rows = [{"module": "b.float32", "arch": 90, "ptx_s": 1.0, "ptxas_s": 1.0, **needs}]
+    accept(rows)
+    put(rows, page)
+    assert limits() == {
+        "b.float32": {"ptx_bytes": 125, "registers": 255, "stack": STACK - 1, "spills": 10},
+        "c.float32": {"ptx_bytes": 1, "registers": 2, "stack": 3, "spills": 4},
+    }
+    text = page.read_text()
+    assert text.startswith(f"above\n{BEGIN}\n\n| module | compile [s] |") and text.endswith(f"{END}\nbelow\n")
+    assert "\n| `b` | 2 | 250 | 2000 | 8 |\n| `c` | 9 |\n" in text
+
+
 @needs_ptxas
 def test_code_is_where_warp_looks_for_it_and_is_made_once(modules: dict[str, Any], tmp_path: Path) -> None:
     """An interrupted run goes on with the architecture that is missing; what is there is not compiled again."""
@@ -111,11 +143,26 @@ def test_limits_hold_and_records_are_not_copied(tmp_path: Path) -> None:
     assert len(rows) == 4 and stacks["dead_reckoning.float32"] < 1000
 
 
+@needs_ptxas
+def test_limits_of_parts_of_robust_hold(tmp_path: Path) -> None:
+    """Their loops over matrices are where registers run out first: a third 6x6 matrix doubled the stack."""
+    assert len(checked(tmp_path, "--only", "robust_(correct|fuse)", "--dtype", "float32", "--arch", "90")) == 2
+
+
 def test_mistakes_are_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert main(["--only", "nothing", "--dtype", "float32", "--out", str(tmp_path)]) == 2
     assert capsys.readouterr().err == "error: --only: no module has 'nothing' in its name\n"
+    assert main(["--accept", "--arch", "90"]) == 2
+    assert capsys.readouterr().err.startswith("error: --accept needs both precisions and all architectures")
+    for wrong, words in (
+        (["--only", "("], "expected a regular expression, got '('"),
+        (["--jobs", "0"], "positive number"),
+    ):
+        with pytest.raises(SystemExit):
+            main(wrong)
+        assert wrong[0] in (error := capsys.readouterr().err) and words in error
     monkeypatch.setattr("benchmarks.cuda_check.metadata.files", lambda name: None)
     assert main(["--only", "host", "--dtype", "float32", "--out", str(tmp_path)]) == 2
     assert "pip install --no-deps nvidia-cuda-nvcc" in capsys.readouterr().err

@@ -387,10 +387,9 @@ def regress(model: Any, memory: Any, world: int, i: int, n: int, received: bool)
     are not used.
     """
     first = wp.where(received, 1, 0)
-    after = stated_covariance(model, memory, world, i, n)
     memory.known[world, i, 0].member = n
-    memory.known[world, i, 0].covariance = after
-    memory.scratch[world, i, n].column = factor(after)
+    memory.known[world, i, 0].covariance = stated_covariance(model, memory, world, i, n)
+    memory.scratch[world, i, n].column = factor(memory.known[world, i, 0].covariance)
     sure = note_correlations(model, memory, world, i, n, received, first, True)
     count = note_correlations(model, memory, world, i, n, received, sure, False)
     solve_for(model, memory, world, i, n, count)
@@ -402,4 +401,5 @@ def regress(model: Any, memory: Any, world: int, i: int, n: int, received: bool)
     larger = wp.float64(1.0) + dependence_inflation(memory, world, i, n)  # the added error is the same one
     for k in range(memory.belief[world, i].members):
         memory.scratch[world, i, k].row = wp.sqrt(larger) * memory.scratch[world, i, k].row
+    after = stated_covariance(model, memory, world, i, n)
     memory.scratch[world, i, n].row = larger * (after + excess(memory.scratch[world, i, n].column, after))

@@ -65,7 +65,6 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
     first_sender = memory.belief[world, i].first_sender
     turn = wp.transpose(memory.scratch[world, i, 0].pose.R)
     own = memory.sensitivity[world, i, q, 0]
-    errors = memory.sensitivity[world, i, q, ERRORS]
     mounting = memory.sensitivity[world, i, q, MOUNTING]
     vector = memory.source[world, i, q].vector
     A = memory.information[world, i, q, 0]
@@ -90,13 +89,13 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
             vector = vector + wp.transpose(weighted) * memory.measurement[world, i, n].innovation
             if fits == 1:
                 own = own - wp.transpose(memory.projection[world, i, n, 0]) * WM
-                errors = errors - wp.transpose(memory.projection[world, i, n, ERRORS]) * WM
+                change = wp.transpose(memory.projection[world, i, n, ERRORS]) * WM
+                memory.sensitivity[world, i, q, ERRORS] = memory.sensitivity[world, i, q, ERRORS] - change
                 if first_sender > MOUNTING:
                     mounting = mounting - wp.transpose(memory.projection[world, i, n, MOUNTING]) * WM
     memory.source[world, i, q].vector = vector
     memory.information[world, i, q, 0] = A
     memory.sensitivity[world, i, q, 0] = diagonal_by_rows(memory.scratch[world, i, 0].recentring, own)
-    memory.sensitivity[world, i, q, ERRORS] = errors
     if first_sender > MOUNTING:
         memory.sensitivity[world, i, q, MOUNTING] = diagonal_by_rows(
             memory.scratch[world, i, MOUNTING].recentring, mounting

@@ -184,16 +184,17 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
 
 
 @subroutine
-def write_resected_covariance(memory: Any, world: int, i: int, bearings: int, inverse: Any):
-    """Set the own covariance to that of the resection, members' errors included."""
+def write_resected_covariance(memory: Any, world: int, i: int, bearings: int):
+    """Set the own covariance to that of the resection, members' errors included; (H^T W H)^-1 is in `scratch.row`."""
     members = memory.belief[world, i].members
-    own = mat66d()
+    memory.P[world, i, 0, 0] = mat66d()
     for k in range(members):
         memory.scratch[world, i, k].column = mat66d()
     for n in range(bearings):
         if memory.measurement[world, i, n].fits == 1:
             HtW = wp.transpose(memory.derivative[world, i, n, 0].jacobian) * memory.measurement[world, i, n].weight
-            own += (HtW * wp.transpose(HtW)) * memory.measurement[world, i, n].noise
+            own = memory.P[world, i, 0, 0] + (HtW * wp.transpose(HtW)) * memory.measurement[world, i, n].noise
+            memory.P[world, i, 0, 0] = own
             member = memory.measurement[world, i, n].member
             if member > 0:
                 memory.scratch[world, i, member].column += HtW * memory.derivative[world, i, n, 1].jacobian
@@ -201,16 +202,17 @@ def write_resected_covariance(memory: Any, world: int, i: int, bearings: int, in
         cross = mat66d()
         for j in range(1, members):
             cross += memory.scratch[world, i, j].column * memory.P[world, i, j, k]
-        own += cross * wp.transpose(memory.scratch[world, i, k].column)
-        set_block(memory, world, i, 0, k, -(inverse * cross))
-    memory.P[world, i, 0, 0] = symmetric_part(inverse * own * wp.transpose(inverse))
+        own = memory.P[world, i, 0, 0] + cross * wp.transpose(memory.scratch[world, i, k].column)
+        memory.P[world, i, 0, 0] = own
+        set_block(memory, world, i, 0, k, -(memory.scratch[world, i, 0].row * cross))
+    inverse = memory.scratch[world, i, 0].row
+    memory.P[world, i, 0, 0] = symmetric_part(inverse * memory.P[world, i, 0, 0] * wp.transpose(inverse))
 
 
 @subroutine
 def resect(frame: BearingFrame, memory: Any, world: int, i: int) -> bool:
     """Resect the own pose from a frame by least squares; return whether in all steps three bearings determine it."""
     bearings = frame.bearings
-    inverse = mat66d()
     for step in range(constants.MAX_ITERATIONS):
         _, fitting, _ = gate(frame, memory, world, i)
         M = mat66d()
@@ -234,7 +236,8 @@ def resect(frame: BearingFrame, memory: Any, world: int, i: int) -> bool:
             return False
         if step < constants.MAX_ITERATIONS - 1:
             apply_error(memory, world, i, 0, inverse * b)
-    write_resected_covariance(memory, world, i, bearings, inverse)
+        memory.scratch[world, i, 0].row = inverse
+    write_resected_covariance(memory, world, i, bearings)
     return True
 
 
