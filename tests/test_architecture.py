@@ -100,7 +100,7 @@ LINES_AND_FILES = {
     "scenario": (3710, 12),
     "training": (1600, 6),
     "viz": (4830, 16),
-    "world": (5595, 18),
+    "world": (5603, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 MOST_FILES = 240

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from coopenv.api.engine import Engine
-from coopenv.base.errors import CoopenvError, ScenarioError
+from coopenv.base.errors import CoopenvError, ScenarioError, ScenarioWarning
 from coopenv.estimation import Sight
 from coopenv.scenario import Scenario
 from coopenv.world.state import size_of, state_sizes, state_struct
@@ -99,6 +99,11 @@ def test_all_in_range_are_kept_in_order() -> None:
 def test_too_many_in_range_are_one_line() -> None:
     with pytest.raises(CoopenvError, match=r"^topology\.most_nearby: \d+ targets and senders are in range of vehicle_"):
         start(street(5), 0)
+    world = start(street(60), 0)
+    world.state.crowded.fill_(3)
+    world.device = "cuda:0"  # where only resets look
+    with pytest.warns(ScenarioWarning, match=r"63 targets and senders are in range of vehicle_1 in world 0, not 60"):
+        world.reset([0])
 
 
 @pytest.mark.parametrize(
