@@ -253,7 +253,8 @@ def _reading(path: Path, key: str) -> Iterator[None]:
 def _shape(text: str) -> Shape:
     """Return the points of a text, without those that repeat the one before."""
     points = np.array([[float(x) for x in point.split(",")[:2]] for point in text.split()]).reshape(-1, 2)
-    return points[np.append(True, np.diff(points, axis=0).any(axis=1))[: len(points)]]
+    kept: Shape = points[np.append(True, np.diff(points, axis=0).any(axis=1))[: len(points)]]
+    return kept
 
 
 def _roads(network: Network) -> Iterator[dict[str, Any]]:
