@@ -11,6 +11,9 @@ from dataclasses import dataclass, field
 from math import inf, nan
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
+from coopenv.base.sections import LARGEST
+
+Bounds = tuple[float, float] | range  # lowest and highest number; of a range only whole ones
 
 GRAMMAR = "[VEHICLE:]NAME[=VALUE][@START[+DURATION]][,OPTION=VALUE...]"
 _FORM = re.compile(
@@ -33,7 +36,7 @@ class FaultKind:
     default: float | None = None
     """Value of a fault without one; None: the value is required."""
     low: float = 0.0
-    high: float = inf
+    high: float = LARGEST
     words: Mapping[str, float] = field(default_factory=dict)
     """Words before the value, `WORD[:VALUE]`, each with its default; empty: the value is a number."""
     free_word: bool = False
@@ -41,9 +44,8 @@ class FaultKind:
     start: bool = False
     """Whether `@START` is allowed."""
     duration: bool = False
-    options: tuple[str, ...] = ()
-    signed: tuple[str, ...] = ()
-    """Those of them that may be negative."""
+    options: Mapping[str, Bounds] = field(default_factory=dict)
+    unused: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # options that a word does not have
     vehicles: bool = False
     """Whether the fault is of single vehicles."""
 
@@ -87,18 +89,19 @@ def parse_fault(text: str, kinds: Mapping[str, FaultKind]) -> Fault:
     for part in (part for part, may in allowed.items() if found[part] is not None and not may):
         raise FaultError(f"{where}: has no {part}, got {shown(found[part])}")
     word, value = _value(found["value"], kind, where, name)
+    bounds = {key: limits for key, limits in kind.options.items() if key not in kind.unused.get(word, ())}
     options = {}
     for option in found["options"].split(",")[1:]:
         key, equals, given = option.partition("=")
         if not equals or key in options:
             raise FaultError(f"{where}: {shown(option)} is not OPTION=VALUE, each option once")
-        if key not in kind.options:
-            raise FaultError(f"{where}: no option {shown(key)}; allowed: {listed(kind.options) or 'none'}")
-        options[key] = _number(given, f"{where}: {key}", -inf if key in kind.signed else 0.0)
+        if key not in bounds:
+            raise FaultError(f"{where}: no option {shown(key)}; allowed: {listed([*bounds]) or 'none'}")
+        options[key] = _number(given, f"{where}: {key}", bounds[key])
     start = found["start"]
     is_share = start is not None and start.endswith("%")
     most = 100.0 if is_share else 1e6
-    begin = None if start is None else _number(start.removesuffix("%"), f"{where}: start", 0.0, most)
+    begin = None if start is None else _number(start.removesuffix("%"), f"{where}: start", (0.0, most))
     return Fault(
         text,
         name,
@@ -107,7 +110,7 @@ def parse_fault(text: str, kinds: Mapping[str, FaultKind]) -> Fault:
         tuple(found["vehicles"].split(",")) if found["vehicles"] else (),
         begin / 100.0 if begin is not None and is_share else begin,
         is_share,
-        inf if found["duration"] is None else _number(found["duration"], f"{where}: duration", 0.0, 1e6),
+        inf if found["duration"] is None else _number(found["duration"], f"{where}: duration", (0.0, 1e6)),
         options,
     )
 
@@ -117,7 +120,7 @@ def _value(text: str | None, kind: FaultKind, where: str, name: str) -> tuple[st
     if kind.words:
         word, colon, number = (text or "").partition(":")
         check_one_of(f"{where}: unknown {name}", word, kind.words, FaultError)
-        return word, _number(number, f"{where}: value", kind.low, kind.high) if colon else kind.words[word]
+        return word, _number(number, f"{where}: value", (kind.low, kind.high)) if colon else kind.words[word]
     word = ""
     if kind.free_word and text is not None:
         word, _, text = text.rpartition(":")
@@ -127,14 +130,15 @@ def _value(text: str | None, kind: FaultKind, where: str, name: str) -> tuple[st
         return word, kind.default
     if not kind.value:
         raise FaultError(f"{where}: has no value, got {shown(text)}")
-    return word, _number(text, f"{where}: value", kind.low, kind.high)
+    return word, _number(text, f"{where}: value", (kind.low, kind.high))
 
 
-def _number(text: str, where: str, low: float = 0.0, high: float = inf) -> float:
+def _number(text: str, where: str, bounds: Bounds) -> float:
     try:
         number = float(text)
     except ValueError:
         number = nan
-    if not low <= number <= high or abs(number) == inf:
-        raise FaultError(f"{where}: expected a number from {low:g} to {high:g}, got {shown(text)}")
+    if not (number in bounds if isinstance(bounds, range) else bounds[0] <= number <= bounds[-1]):
+        kind = "whole number" if isinstance(bounds, range) else "number"
+        raise FaultError(f"{where}: expected a {kind} from {bounds[0]:g} to {bounds[-1]:g}, got {shown(text)}")
     return number

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from coopenv.base.errors import CoopenvError, listed, shown, suggest
 from coopenv.base.fault_text import Fault, FaultError, FaultKind, parse_fault
+from coopenv.base.sections import LARGEST
 from coopenv.bench.observers.changes import (
     NO_FOLLOWERS,
     leaders_of,
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
     from coopenv.observers.recording import Recording
 
 NOMINAL = "nominal"
+SIZE, ANY = (0.0, LARGEST), (-LARGEST, LARGEST)
+"""Bounds of options."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         "RATE",
         "by which gyros are biased about the vertical from START on, rad/s; undeclared",
         0.02,
-        low=-math.inf,
+        low=-LARGEST,
         start=True,
         vehicles=True,
         change=with_gyro_step,
@@ -100,12 +103,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         change=with_scale_drift,
     ),
     "landmarks_lost": RecordFault(
-        "",
-        "no landmark is visible",
-        0.0,
-        start=True,
-        duration=True,
-        change=without_landmarks,
+        "", "no landmark is visible", 0.0, start=True, duration=True, change=without_landmarks
     ),
     "map_error": RecordFault(
         "[LANDMARK:]METRES",
@@ -113,8 +111,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         1.0,
         free_word=True,
         start=True,
-        options=("angle", "spread"),
-        signed=("angle",),
+        options={"angle": ANY, "spread": SIZE},
         vehicles=True,
         change=with_map_error,
     ),
@@ -124,8 +121,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         math.inf,
         start=True,
         duration=True,
-        options=("x", "y", "z", "period", "duty"),
-        signed=("x", "y", "z"),
+        options={"x": ANY, "y": ANY, "z": ANY, "period": (1e-3, LARGEST), "duty": (0.0, 1.0)},
         vehicles=True,
         change=with_jammer,
     ),
@@ -134,20 +130,23 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         "a vehicle broadcasts another pose: jump or collude (m), drift (m/s), replay (s)",
         words={"jump": 5.0, "drift": 0.05, "replay": 1.0, "collude": 5.0},
         start=True,
-        options=("std", "turn", "angle", "honest_odometry"),
-        signed=("turn", "angle"),
+        options={"std": SIZE, "turn": ANY, "angle": ANY, "honest_odometry": range(2)},
+        unused={"replay": ("turn", "angle")},
         vehicles=True,
         change=with_lie,
     ),
     "odometry_scale": WorldFault("STD", "of the odometry's scale error", key="noise.odometry_scale"),
     "gyro_bias": WorldFault("STD", "of the gyro's bias per axis, rad/s", key="noise.gyro_bias"),
     "slip": WorldFault(
-        "RATE", "at which wheels begin to slip, 1/s", options=("duration", "size", "angle"), key="noise.slip.rate"
+        "RATE",
+        "at which wheels begin to slip, 1/s",
+        options={"duration": SIZE, "size": SIZE, "angle": SIZE},
+        key="noise.slip.rate",
     ),
     "extrinsics": WorldFault(
         "STD",
         "per axis of the rotation of the true camera against the nominal one, rad; position: likewise, m",
-        options=("position",),
+        options={"position": SIZE},
         key="camera.extrinsics_error",
         renamed={"position": "extrinsics_position_error"},
     ),
@@ -158,7 +157,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         "at START a vehicle's observer loses its state and starts anew",
         1.0,
         start=True,
-        options=("spread",),
+        options={"spread": SIZE},
         key="faults.restart.chance",
         renamed={"start": "time", "spread": "time_spread"},
         of_one=True,
@@ -168,7 +167,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         "that a message's pose is altered on the way",
         high=1.0,
         start=True,
-        options=("size", "turn"),
+        options={"size": SIZE, "turn": SIZE},
         key="faults.corruption.probability",
     ),
 }
@@ -227,8 +226,6 @@ def variant_of(text: str, name: str = "") -> FaultVariant:
         fixed = not {"x", "y", "z"}.isdisjoint(fault.options)
         if fault.name == "jammer" and fixed + bool(fault.vehicles) != (fault.value < math.inf):
             raise FaultError(f"fault {fault.text}: expected jammer, VEHICLE:jammer=METRES or jammer=METRES,x=X,y=Y")
-        if fault.options.get("period") == 0.0:
-            raise FaultError(f"fault {fault.text}: period must be above 0")
     return FaultVariant(name or text, faults)
 
 
