@@ -21,6 +21,7 @@ import numpy as np
 from rich.console import Console
 
 import coopenv
+from benchmarks.options import at_least
 from coopenv.base.errors import EVALUATION_SEEDS, CoopenvError
 from coopenv.base.format import in_parentheses
 from coopenv.bench.observers.changes import DIRECTION
@@ -240,13 +241,15 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(prog="python -m benchmarks.adversary", description=__doc__)
     made.add_argument("--targets", choices=TARGETS, default="many", help="of every vehicle (default: many)")
-    made.add_argument("--rate", type=float, default=0.3, help="fastest drift, m/s (default: 0.3)")
-    made.add_argument("--horizon", type=float, default=30.0, help="length of an episode, s (default: 30)")
-    made.add_argument("--generations", type=int, default=12, help="of each search (default: 12)")
-    made.add_argument("--population", type=int, default=16, help="candidates per generation (default: 16)")
-    made.add_argument("--seeds", type=int, default=2, help="training seeds per candidate (default: 2)")
-    made.add_argument("--held-out", type=int, default=16, help="evaluation seeds (default: 16)")
-    made.add_argument("--held-out-host", type=int, default=4, help="of observers on the host (default: 4)")
+    made.add_argument("--rate", type=at_least(1e-3), default=0.3, help="fastest drift, m/s (default: 0.3)")
+    made.add_argument(
+        "--horizon", type=at_least(START + 1.0), default=30.0, help="length of an episode, s (default: 30)"
+    )
+    made.add_argument("--generations", type=at_least(1), default=12, help="of each search (default: 12)")
+    made.add_argument("--population", type=at_least(1), default=16, help="candidates per generation (default: 16)")
+    made.add_argument("--seeds", type=at_least(1), default=2, help="training seeds per candidate (default: 2)")
+    made.add_argument("--held-out", type=at_least(1), default=16, help="evaluation seeds (default: 16)")
+    made.add_argument("--held-out-host", type=at_least(1), default=4, help="of observers on the host (default: 4)")
     return made
 
 

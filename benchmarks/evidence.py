@@ -1,6 +1,6 @@
 """`python -m benchmarks.evidence`: observers in the parametric scenes, and under errors that no scenario declares.
 
-Both tables are Markdown. With `--page` they replace the section of that page between the marks of their name.
+The tables are Markdown. With `--page` they replace the section of that page between the marks of their name.
 """
 
 from __future__ import annotations
@@ -8,12 +8,15 @@ from __future__ import annotations
 import argparse
 import sys
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 import coopenv
+from benchmarks.options import at_least
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
 from coopenv.base.format import in_parentheses
@@ -34,48 +37,86 @@ HORIZON = 50.0
 """s, of the parametric scenes."""
 WINDOWS = (5.0, 10.0, 20.0, 35.0)
 """s."""
-CHANGED_OBSERVERS = ("riccati", "mekf_covariance", "schmidt_kalman", "robust")
+CHANGED_OBSERVERS = ("schmidt_kalman", "robust")
 """In changed recordings."""
 CHANGED_HORIZON = 30.0
 """s, of the changed recordings."""
 JUDGED_FROM = 15.0
 """s, in changed recordings."""
+MERGING_FROM = 4.0
+"""s, from which the merging platoons are judged."""
+FAULT_SHARE = 0.4
+"""Of a run, after which lies begin and protection levels are judged."""
+OVERCONFIDENT = (5.0, 1.0)
+"""m: error above, and stated deviation below which an estimate is overconfident."""
 STEP_AT = 12.0
 """s, at which the gyro bias steps."""
 ANGLE = np.arctan2(0.6, 0.8)
 """rad, of a landmark's error in the map."""
 
+RAMP = np.radians(6.0)
+"""Angle between the merging platoons."""
+
 BASE = "busy_intersection_tracking"
-"""Whose noise, initial errors and observer settings the road has."""
+"""Whose noise, initial errors and observer settings the platoons have."""
 
 
 def road() -> Scenario:
     """Return two platoons that meet on a road at 25 m/s each, with cameras of 10 Hz and 34 landmarks."""
-    keys = tomllib.loads(scenario_path(BASE).read_text(encoding="utf-8"))
-    defaults = keys.pop("vehicle_defaults")
     sides = [(x, 80.0 * n, z) for n in range(17) for x, z in ((-9.0, 4.0), (9.0, 6.0))]
     marks = [f"L{n}" for n in range(1, len(sides) + 1)]
-    lines = [(2.0, 0.0, 25.0, marks), (2.0, -20.0, 25.0, ["vehicle_1", *marks[8:10]])]
-    lines += [(2.0, -20.0 * n, 25.0, [f"vehicle_{n - 1}", f"vehicle_{n}", *marks[8:10]]) for n in (2, 3)]
-    lines += [(-2.0, 1200.0, -25.0, marks[:20]), (-2.0, 1222.0, -25.0, ["vehicle_1", "vehicle_2", "vehicle_5", "L4"])]
-    lines += [(-2.0, 1243.0, -25.0, ["vehicle_2", "vehicle_3", "vehicle_5", "vehicle_6"])]
+    north, south = (0.0, 25.0), (0.0, -25.0)
+    lines = [(2.0, 0.0, north, marks), (2.0, -20.0, north, ["vehicle_1", *marks[8:10]])]
+    lines += [(2.0, -20.0 * n, north, [f"vehicle_{n - 1}", f"vehicle_{n}", *marks[8:10]]) for n in (2, 3)]
+    lines += [(-2.0, 1200.0, south, marks[:20]), (-2.0, 1222.0, south, ["vehicle_1", "vehicle_2", "vehicle_5", "L4"])]
+    lines += [(-2.0, 1243.0, south, ["vehicle_2", "vehicle_3", "vehicle_5", "vehicle_6"])]
+    return straight("road", CHANGED_HORIZON, (-80.0, 1300.0), dict(zip(marks, sides, strict=True)), lines)
+
+
+def merging() -> Scenario:
+    """Return two platoons that merge at 20 m/s, with cameras of 10 Hz and landmarks that most vehicles leave behind."""
+    sides = [(x, 60.0 * n, z) for n in range(9) for x, z in ((-8.0, 4.0), (8.0, 6.0))]
+    marks = [f"L{n}" for n in range(1, len(sides) + 1)]
+    north, ramp = (0.0, 20.0), (-20.0 * np.sin(RAMP), 20.0 * np.cos(RAMP))
+    lines = [(0.0, 60.0, north, marks), (0.0, 46.0, north, ["vehicle_1", *marks[:3]])]
+    lines += [(0.0, 60.0 - 14.0 * n, north, [f"vehicle_{n - 1}", f"vehicle_{n}", *marks[:2]]) for n in range(2, 6)]
+    x = 3.5 - 9.0 * ramp[0]  # beside the other platoon after 9 s
+    lines += [(x, 53.0, ramp, ["vehicle_1", "vehicle_2", "L5"])]
+    lines += [(x, 53.0 - 14.0 * n, ramp, [f"vehicle_{n + k}" for k in (6, 2, 3)]) for n in (1, 2, 3)]
+    return straight("merging", 18.0, (-80.0, 600.0), dict(zip(marks, sides, strict=True)), lines)
+
+
+Line = tuple[float, float, tuple[float, float], list[str]]
+"""x and y, m, velocity, m/s, and neighbours of a vehicle."""
+
+
+def straight(
+    name: str,
+    horizon: float,
+    ends: tuple[float, float],
+    landmarks: Mapping[str, Sequence[float]],
+    lines: Sequence[Line],
+) -> Scenario:
+    """Return vehicles with constant velocities beside a straight road."""
+    keys = tomllib.loads(scenario_path(BASE).read_text(encoding="utf-8"))
+    defaults = keys.pop("vehicle_defaults")
     keys |= {
-        "title": "Road",
-        "horizon": CHANGED_HORIZON,
-        "roads": [{"start": [0.0, -80.0], "end": [0.0, 1300.0], "width": 8.0}],
-        "landmarks": [{"name": name, "position": list(side)} for name, side in zip(marks, sides, strict=True)],
+        "title": name.capitalize(),
+        "horizon": horizon,
+        "roads": [{"start": [0.0, ends[0]], "end": [0.0, ends[1]], "width": 8.0}],
+        "landmarks": [{"name": mark, "position": list(place)} for mark, place in landmarks.items()],
         "vehicles": [
             defaults
             | {
                 "initial_pose": {"position": [x, y, 1.5]},
-                "motion": {"kind": "constant", "linear": [0.0, speed, 0.0]},
+                "motion": {"kind": "constant", "linear": [*velocity, 0.0]},
                 "neighbours": neighbours,
             }
-            for x, y, speed, neighbours in lines
+            for x, y, velocity, neighbours in lines
         ],
     }
     keys["rates"] |= {"camera": 10.0, "odometry": 100.0}
-    return parse_scenario(keys, "road")
+    return parse_scenario(keys, name)
 
 
 def tracking() -> Scenario:
@@ -97,10 +138,89 @@ CHANGES = {
 """Faults of `coopenv.bench.observers.faults`."""
 
 
+IN_TURN = "one landmark in turn off by {} m"
+MERGING_CHANGES = {
+    "none": "",
+    **{IN_TURN.format(size): f"map_error=IN_TURN:{size},angle={ANGLE}" for size in ("0.5", "1", "3")},
+    "odometry scale error grows to 4 %": "scale_drift=0.04",
+}
+LEVEL_CHANGES = {
+    "none": "",
+    IN_TURN.format("3"): f"map_error=IN_TURN:3,angle={ANGLE}",
+    "the second vehicle lies by 1 m": f"vehicle_2:lie=jump:1@{FAULT_SHARE:.0%}",
+    "odometry scale error grows to 10 %": "scale_drift=0.1",
+    "the first two collude, 5 m": f"vehicle_1,vehicle_2:lie=collude:5@{FAULT_SHARE:.0%}",
+}
+
+
 def changed(recording: Recording, fault: str, seed: int) -> Recording:
-    """Return a recording with a fault, in which LANDMARK is the second one of three, the tenth one of 34."""
-    landmark = recording.setups[0].target_names[1 if recording.landmarks.shape[1] < 10 else 9]
-    return variant_of(fault.replace("LANDMARK", landmark), "changed").applied(recording, seed)
+    """Return a recording with a fault.
+
+    In its text LANDMARK is the second landmark of three, or the tenth of 34; IN_TURN changes with the seed, among those
+    that vehicles other than the first one see.
+    """
+    names, count = recording.setups[0].target_names, recording.landmarks.shape[1]
+    seen = sorted({int(target) for setup in recording.setups[1:] for target in setup.targets if target < count})
+    words = {"LANDMARK": names[1 if count < 10 else 9], "IN_TURN": names[seen[seed % len(seen)]]}
+    for word, name in words.items():
+        fault = fault.replace(word, name)
+    return variant_of(fault, "changed").applied(recording, seed)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Honest vehicles in the recordings of all seeds."""
+
+    rmse: Array  # (seeds, vehicles), m
+    anees: Array  # (seeds, vehicles)
+    error: Array  # of all vehicle ticks, as the following ones, m
+    deviation: Array  # stated, m
+    horizontal: Array  # error, m
+    level: Array  # horizontal protection level, m
+
+    @property
+    def mean(self) -> str:
+        """Mean RMSE with its standard error over the seeds."""
+        values = self.rmse.mean(axis=1)
+        return in_parentheses(float(values.mean()), standard_error(values))
+
+    @property
+    def overconfident(self) -> str:
+        """Share of the vehicle ticks, %."""
+        return _percent((self.error > OVERCONFIDENT[0]) & (self.deviation < OVERCONFIDENT[1]))
+
+    @property
+    def exceeded(self) -> str:
+        """Share of the vehicle ticks in which the error exceeds the protection level, %; `-` without levels."""
+        return "-" if np.isnan(self.level).all() else _percent(self.horizontal > self.level)
+
+    @property
+    def levels(self) -> str:
+        """Share exceeded, %, share unknown, %, and median of the known levels over the 95th percentile of the error."""
+        known = np.isfinite(self.level)
+        ratio = np.median(self.level[known]) / np.percentile(self.horizontal[known], 95) if known.any() else np.nan
+        return f"{self.exceeded}, {_percent(~known)}, {ratio:.1f}"
+
+
+def outcome(recordings: Mapping[int, Recording], fault: str, observer: str, since: float) -> Outcome:
+    """Return what an observer makes of recordings, by seed, with a fault, from a time on."""
+    found: dict[str, list[Array]] = {name: [] for name in Outcome.__dataclass_fields__}
+    for seed, recording in recordings.items():
+        part = changed(recording, fault, seed)
+        result, when = run(observer, part), recording.t >= since
+        lying = () if part.interference is None else part.interference.shift.any(axis=(0, 2)).nonzero()[0]
+        shown = np.delete(np.arange(len(recording.setups)), lying)
+        error = result.position_error[when][:, shown]
+        away = (result.position - recording.truth.position)[when][:, shown, :2]
+        variance = np.trace(result.covariance[when][:, shown, 3:, 3:], axis1=-2, axis2=-1)
+        found["rmse"].append(np.sqrt(np.square(error).mean(axis=0)))
+        found["anees"].append(result.anees(since)[shown])
+        found["error"].append(error.ravel())
+        found["deviation"].append(np.sqrt(variance).ravel())
+        found["horizontal"].append(np.linalg.norm(away, axis=-1).ravel())
+        found["level"].append(result.protection_level[when][:, shown, 0].ravel())
+    pooled = ("rmse", "anees")
+    return Outcome(**{name: (np.stack if name in pooled else np.concatenate)(values) for name, values in found.items()})
 
 
 def scenes(seeds: Sequence[int], jobs: int) -> str:
@@ -124,42 +244,68 @@ def scenes(seeds: Sequence[int], jobs: int) -> str:
 
 
 def undeclared(seeds: Sequence[int], jobs: int) -> str:
-    """Return the table of errors that the scenario does not declare: mean RMSE over the vehicles, m, by observer."""
+    """Return the table of errors that the scenario does not declare: mean RMSE, worst error, m, and largest ANEES."""
     rows = []
     for scene, scenario in (("tracking", tracking()), ("road", road())):
-        recordings = [record(scenario, seed) for seed in seeds]
+        recordings = {seed: record(scenario, seed) for seed in seeds}
         for name, fault in CHANGES.items():
             cells = []
             for observer in CHANGED_OBSERVERS:
-                errors, anees = [], []
-                for seed, recording in zip(seeds, recordings, strict=True):
-                    found = run(observer, changed(recording, fault, seed))
-                    errors.append(found.position_rmse(JUDGED_FROM).mean())
-                    anees.append(found.anees(JUDGED_FROM))
-                cells.append(f"{_mean(np.array(errors))} ({_compact(np.mean(anees, axis=0).max())})")
+                found = outcome(recordings, fault, observer, JUDGED_FROM)
+                cells += [found.mean, f"{found.error.max():.2g}", _compact(found.anees.mean(axis=0).max())]
             rows.append([scene, name, *cells])
             print(" | ".join(rows[-1]), file=sys.stderr, flush=True)
-    return table(["scene", "error", *(f"`{observer}`" for observer in CHANGED_OBSERVERS)], rows)
+    heads = [head for observer in CHANGED_OBSERVERS for head in (f"`{observer}`", "worst", "ANEES")]
+    return table(["scene", "error", *heads], rows)
 
 
-def _mean(values: Array) -> str:
-    return in_parentheses(float(values.mean()), standard_error(values))
+def merged(seeds: Sequence[int], jobs: int) -> str:
+    """Return the table of the merging platoons: RMSE of a vehicle, worst error, m, and shares of vehicle ticks, %."""
+    rows, recordings = [], {seed: record(merging(), seed) for seed in seeds}
+    for name, fault in MERGING_CHANGES.items():
+        for observer in CHANGED_OBSERVERS:
+            found = outcome(recordings, fault, observer, MERGING_FROM)
+            size = [f"{np.median(found.rmse):.2g}", f"{found.error.max():.2g}"]
+            rows.append([name, f"`{observer}`", found.mean, *size, found.overconfident, found.exceeded])
+            print(" | ".join(rows[-1]), file=sys.stderr, flush=True)
+    return table(["error", "observer", "mean", "median", "worst", "overconfident, %", "level exceeded, %"], rows)
+
+
+def levels(seeds: Sequence[int], jobs: int) -> str:
+    """Return the table of the protection levels of `robust`, see `Outcome.levels`."""
+    rows = {name: [name] for name in LEVEL_CHANGES}
+    for scenario in (tracking(), road(), merging()):
+        recordings = {seed: record(scenario, seed) for seed in seeds}
+        for name, fault in LEVEL_CHANGES.items():
+            found = outcome(recordings, fault, "robust", FAULT_SHARE * scenario.horizon)
+            rows[name].append(found.levels)
+            print(" | ".join(rows[name]), file=sys.stderr, flush=True)
+    return table(["error", "tracking", "road", "merging"], list(rows.values()))
+
+
+def _percent(true: NDArray[np.bool_]) -> str:
+    return f"{100.0 * true.mean():.2g}"
 
 
 def _compact(value: float) -> str:
     return f"{value:.1f}" if value < 100.0 else f"{value:.0f}" if value < 1e5 else f"{value:.0e}"
 
 
-PARTS: dict[str, Callable[[Sequence[int], int], str]] = {"scenes": scenes, "undeclared": undeclared}
+PARTS: dict[str, Callable[[Sequence[int], int], str]] = {
+    "scenes": scenes,
+    "undeclared": undeclared,
+    "merging": merged,
+    "levels": levels,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print; return the exit status: 0, or 2 after a mistake in the input."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.evidence", description=__doc__)
     parser.add_argument("what", choices=tuple(PARTS))
-    parser.add_argument("--seeds", type=int, default=8, help="number of seeds (default: 8)")
-    parser.add_argument("--first", type=int, default=50, help="the first seed (default: 50)")
-    parser.add_argument("--jobs", type=int, default=1, help="number of processes (default: 1)")
+    parser.add_argument("--seeds", type=at_least(1), default=8, help="number of seeds (default: 8)")
+    parser.add_argument("--first", type=at_least(0), default=50, help="the first seed (default: 50)")
+    parser.add_argument("--jobs", type=at_least(1), default=1, help="number of processes (default: 1)")
     parser.add_argument("--page", type=Path, help="page whose section is replaced")
     asked = parser.parse_args(arguments)
     try:

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from benchmarks.options import at_least
 from coopenv.base.format import in_parentheses
 from coopenv.bench.pages import table
 from coopenv.runs.console import Progress
@@ -248,8 +249,8 @@ def _mean(values: Sequence[float]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure every variant in a process of its own and print the table; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.receipt", description=__doc__)
-    parser.add_argument("--seeds", type=int, default=8, help="number of seeds (default: 8)")
-    parser.add_argument("--first", type=int, default=7000, help="the first seed (default: 7000)")
+    parser.add_argument("--seeds", type=at_least(1), default=8, help="number of seeds (default: 8)")
+    parser.add_argument("--first", type=at_least(0), default=7000, help="the first seed (default: 7000)")
     parser.add_argument("--constants", nargs="*", help="names of constants; none: all")
     parser.add_argument("--variant", help=argparse.SUPPRESS)
     asked = parser.parse_args(arguments)

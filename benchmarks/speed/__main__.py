@@ -8,8 +8,8 @@ import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 
+from benchmarks.options import at_least
 from coopenv.base import interrupts
 
 
@@ -49,25 +49,13 @@ def parser() -> argparse.ArgumentParser:
     found = argparse.ArgumentParser(prog="python -m benchmarks.speed", description=__doc__)
     found.add_argument("environment", nargs="?", default="busy_intersection", metavar="ENV")
     found.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override a scenario key")
-    found.add_argument("--seconds", type=positive(float), help="time per case and round (default: 0.5)")
-    found.add_argument("--repeats", type=positive(int), help="rounds, of which the median counts (default: 5)")
+    found.add_argument("--seconds", type=at_least(1e-3), help="time per case and round (default: 0.5)")
+    found.add_argument("--repeats", type=at_least(1), help="rounds, of which the median counts (default: 5)")
     found.add_argument("--growth", action="store_true", help="also grow vehicles, landmarks and worlds")
     found.add_argument("--quick", action="store_true", help="fewer cases and shorter rounds: under a minute")
     found.add_argument("--no-peers", action="store_true", help="leave other projects' environments out")
     found.add_argument("--out", type=Path, metavar="DIR", help="folder for speed.json and figures (default: none)")
     return found
-
-
-def positive(kind: type[int] | type[float]) -> Any:
-    """Return a reader of positive, finite numbers."""
-
-    def number(text: str) -> float:
-        value = kind(text)
-        if not 0 < value < float("inf"):
-            raise argparse.ArgumentTypeError(f"expected a positive number, got {text}")
-        return value
-
-    return number
 
 
 def command(asked: argparse.Namespace) -> str:

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.machine import machine
+from benchmarks.options import at_least
 from benchmarks.stages.ablated_stages import Setting, ablated_settings, stepper
 from benchmarks.stages.against import HERE, Case, Side, compile_seconds
 from benchmarks.stages.rounds import alternate, ratio
@@ -65,12 +66,12 @@ def parser() -> argparse.ArgumentParser:
     found = argparse.ArgumentParser(prog="python -m benchmarks.stages", description=__doc__)
     found.add_argument("environment", nargs="?", default="busy_intersection", metavar="ENV")
     found.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override a scenario key")
-    found.add_argument("--worlds", type=int, default=512)
+    found.add_argument("--worlds", type=at_least(1), default=512)
     found.add_argument("--dtype", default="float32", choices=("float32", "float64"))
-    found.add_argument("--rounds", type=int, default=9, help="of which the median counts (default: 9)")
-    found.add_argument("--decisions", type=int, default=10, help="per round (default: 10)")
+    found.add_argument("--rounds", type=at_least(1), default=9, help="of which the median counts (default: 9)")
+    found.add_argument("--decisions", type=at_least(1), default=10, help="per round (default: 10)")
     found.add_argument("--against", type=Path, metavar="DIR", help="another checkout: whole ticks of both, in turn")
-    found.add_argument("--compiles", type=int, default=1, help="of each kind, from an empty cache (default: 1)")
+    found.add_argument("--compiles", type=at_least(0), default=1, help="of each kind, from an empty cache (default: 1)")
     return found
 
 

@@ -21,6 +21,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from benchmarks.options import at_least
+from coopenv.base.errors import CoopenvError
+from coopenv.cli.options import load
+
 STAGES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("odometry", ("take_odometry", "propagate_own")),
     ("messages", ("receive_broadcast", "send_broadcast")),
@@ -98,20 +102,33 @@ def count_cycles(folder: Path) -> np.ndarray:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure and print."""
+    """Measure and print; return the exit status: 0, or 2 after a mistake in the input."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.stages.robust_stages", description=__doc__)
     parser.add_argument("environment", nargs="?", default="busy_intersection", metavar="ENV")
-    parser.add_argument("--worlds", type=int, default=256)
-    parser.add_argument("--start", type=float, default=10.0, help="s after which time counts (default: 10)")
-    parser.add_argument("--rounds", type=int, default=9, help="of which the mean and its standard error (default: 9)")
+    parser.add_argument("--worlds", type=at_least(1), default=256)
+    parser.add_argument("--start", type=at_least(0.0), default=10.0, help="s after which time counts (default: 10)")
+    parser.add_argument(
+        "--rounds", type=at_least(2), default=9, help="of which the mean and its standard error (default: 9)"
+    )
     asked = parser.parse_args(arguments)
+    try:
+        measure(asked)
+    except CoopenvError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def measure(asked: argparse.Namespace) -> None:
+    """Measure and print."""
+    overrides = {"observer.name": "robust", "topology.mode": "sensed"}
+    load(asked.environment, overrides)  # a mistake is known before anything is replaced
     with tempfile.TemporaryDirectory() as folder:
         os.environ["WARP_CACHE_PATH"] = folder  # these kernels serve this process only
         import coopenv
         from coopenv.runs.console import number_table
 
         counters = count_cycles(Path(folder))
-        overrides = {"observer.name": "robust", "topology.mode": "sensed"}
         env = coopenv.make_vec(asked.environment, num_worlds=asked.worlds, threads=1, overrides=overrides)
         env.reset(seed=0)
         rng, per_second = np.random.default_rng(0), round(env.scenario.rates.decision)
@@ -131,7 +148,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         table.add_row(name, f"{mean:.0f}", f"{error:.0f}", f"{mean / means.sum():.2f}")
     table.add_row("sum", f"{means.sum():.0f}", "", "1.00")
     Console(markup=False, highlight=False).print(table)
-    return 0
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from inspect import signature
 from pathlib import Path
@@ -15,6 +16,7 @@ from benchmarks import adversary, evidence, linear_case, linearisation, receipt
 from benchmarks.planar.__main__ import main
 from benchmarks.planar.changes import blindfolded, changed, clocks, drifting, hidden, misread, odometry, part
 from benchmarks.planar.lies import Drifting, Replaying
+from benchmarks.stages import robust_stages
 from coopenv.backends.mrclam import recording_of
 from coopenv.bench.observers.faults import variant_of
 from coopenv.observers import run
@@ -44,6 +46,34 @@ def test_a_landmark_is_moved_in_the_map_alone(recording: Recording) -> None:
 def test_the_road_has_two_platoons() -> None:
     scenario = evidence.road()
     assert (len(scenario.vehicles), len(scenario.landmarks)) == (7, 34)
+
+
+def test_two_platoons_merge_and_each_landmark_of_a_follower_is_wrong_in_turn() -> None:
+    scenario = evidence.merging()
+    assert (len(scenario.vehicles), len(scenario.landmarks)) == (10, 18)
+    made = record(scenario, 0)
+    side = [made.truth.position[round(t / made.dt), 6, 0] for t in (0.0, 9.0)]
+    assert side[0] > 20.0 and side[1] == pytest.approx(3.5)
+    wrong = []
+    for seed in range(5):
+        moved = evidence.changed(made, evidence.MERGING_CHANGES["one landmark in turn off by 3 m"], seed)
+        assert moved.interference is not None
+        error = moved.interference.map_error_of(3, 0)
+        wrong += [made.setups[0].target_names[n] for n in np.flatnonzero(error.any(axis=1))]
+        assert_allclose(np.linalg.norm(error), 3.0)
+    assert wrong == ["L1", "L2", "L3", "L5", "L1"]
+
+
+def test_an_outcome_is_of_honest_vehicles(recording: Recording) -> None:
+    found = evidence.outcome({4: recording}, "vehicle_2:lie=jump:1@12", "riccati", 13.0)
+    ticks = int((recording.t >= 13.0).sum())
+    assert found.rmse.shape == found.anees.shape == (1, 4) and found.error.shape == found.level.shape == (4 * ticks,)
+    assert found.exceeded == "-" and found.error.max() >= found.rmse.max() > 0.0
+    assert (found.horizontal <= found.error + 1e-12).all()
+    wrong = replace(found, error=np.array([6.0, 6.0, 4.0, 6.0]), deviation=np.array([0.5, 2.0, 0.5, 0.9]))
+    assert wrong.overconfident == "50"
+    levels = replace(found, horizontal=np.full(4, 2.0), level=np.array([1.0, 4.0, 6.0, np.inf]))
+    assert levels.levels == "25, 25, 2.0"
 
 
 def test_a_page_without_marks_is_left_as_it_is(
@@ -195,6 +225,28 @@ def test_exclusions_are_noted_with_their_time_and_target() -> None:
     watched = receipt.Watched(SimpleNamespace(memory=SimpleNamespace(source=source), setup=setup, update=update))
     assert [watched.update(SimpleNamespace(time=t)) for t in (1.0, 2.0, 3.0)] == [1.0, 2.0, 3.0]
     assert watched.times == [(2.0, 7)] and watched.sees(7) and not watched.sees(4)
+
+
+@pytest.mark.parametrize(
+    ("command", "line", "message"),
+    [
+        (receipt.main, "--first -5", "--first: expected a whole number of at least 0, got -5"),
+        (receipt.main, "--seeds 0", "--seeds: expected a whole number of at least 1, got 0"),
+        (evidence.main, "undeclared --seeds 0", "--seeds: expected a whole number of at least 1, got 0"),
+        (adversary.main, "--rate nan", "--rate: expected a number of at least 0.001, got nan"),
+        (robust_stages.main, "--worlds many", "--worlds: expected a whole number of at least 1, got many"),
+    ],
+)
+def test_numbers_of_options_are_within_bounds(
+    command: Callable[[Sequence[str]], int], line: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        command(line.split())
+    assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_stages_of_an_unknown_environment_are_refused() -> None:
+    assert "unknown environment 'nosuch'" in refused("nosuch", command=robust_stages.main)
 
 
 def test_unknown_constants_are_named() -> None:
