@@ -22,6 +22,7 @@ from coopenv.bench.observers.faults import variant_of
 from coopenv.observers import run
 from coopenv.observers.contract import Message
 from coopenv.observers.recording import Recording
+from coopenv.observers.robust import constants
 from coopenv.runs import record
 from coopenv.scenario import load_scenario
 from tests.helpers.commands import refused
@@ -207,6 +208,23 @@ def test_what_is_left_out_is_part_of_the_observer() -> None:
         assert signature(original).parameters.keys() == signature(replacement).parameters.keys(), name
 
 
+def test_numbers_that_follow_from_a_constant_follow_its_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in vars(constants).copy().items():
+        monkeypatch.setattr(constants, name, value)  # restored after the test
+    before = {name: value for name, value in vars(constants).items() if name.isupper()}
+    receipt.leave_out("MARGIN*2")
+    assert constants.SQUARED_MARGIN / before["SQUARED_MARGIN"] == pytest.approx(4.0)
+    receipt.leave_out("RISK*2")
+    assert_allclose([constants.RISK / before["RISK"], constants.MARGIN / before["MARGIN"]], [2.0, 1.0])
+    gates = {f"{of}_GATE" for of in ("BEARING", "OFFSET", "POSE", "JUMP")}
+    smaller = {name for name in before if getattr(constants, name) < before[name]}
+    assert smaller == {*gates, "PRUNE_GAP", "MAX_PRIOR_COST", "MAX_MISFIT"}
+    receipt.leave_out("nothing")
+    assert {name: getattr(constants, name) for name in before} == before
+    assert {"MARGIN", "RISK", "FAULT_RISK"} <= {*receipt.numbers()}
+    assert not {"SQUARED_MARGIN", "ODDS", "MAX_CONDITION", "BEARING_GATE"} & {*receipt.numbers()}
+
+
 class Source(dict[str, np.ndarray]):
     """Records of two sources."""
 
@@ -224,7 +242,7 @@ def test_exclusions_are_noted_with_their_time_and_target() -> None:
     setup = SimpleNamespace(targets=np.array([3, 7]))
     watched = receipt.Watched(SimpleNamespace(memory=SimpleNamespace(source=source), setup=setup, update=update))
     assert [watched.update(SimpleNamespace(time=t)) for t in (1.0, 2.0, 3.0)] == [1.0, 2.0, 3.0]
-    assert watched.times == [(2.0, 7)] and watched.sees(7) and not watched.sees(4)
+    assert watched.times == [(2.0, 7)] and len(watched.seconds) == 3 and watched.sees(7) and not watched.sees(4)
 
 
 @pytest.mark.parametrize(
