@@ -1,4 +1,4 @@
-"""Extended Kalman filter over the stacked left errors of all vehicles: the upper reference.
+"""Extended Kalman filter over the stacked left errors of all vehicles; the upper reference is `smoother`.
 
 Source: Roumeliotis and Bekey, Distributed multirobot localization, IEEE Transactions on Robotics and Automation 18(5),
 2002, in its centralised form; errors and Jacobians as in pose_filters.py. A bearing from i to a point z_j = p_j
