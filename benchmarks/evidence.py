@@ -208,8 +208,12 @@ def outcome(recordings: Mapping[int, Recording], fault: str, observer: str, sinc
     for seed, recording in recordings.items():
         part = changed(recording, fault, seed)
         result, when = run(observer, part), recording.t >= since
-        lying = () if part.interference is None else part.interference.shift.any(axis=(0, 2)).nonzero()[0]
-        shown = np.delete(np.arange(len(recording.setups)), lying)
+        false, lying = part.interference, np.zeros(len(recording.setups), bool)
+        if false is not None:
+            lying = (
+                (false.shift != 0.0).any(axis=(0, 2)) | (false.turn != 0.0).any(axis=(0, 2)) | false.replay.any(axis=0)
+            )
+        shown = np.flatnonzero(~lying)
         error = result.position_error[when][:, shown]
         away = (result.position - recording.truth.position)[when][:, shown, :2]
         variance = np.trace(result.covariance[when][:, shown, 3:, 3:], axis1=-2, axis2=-1)
@@ -233,42 +237,46 @@ def scenes(seeds: Sequence[int], jobs: int) -> str:
             for name in (f"{WINDOWS[0]:g}-{WINDOWS[1]:g} s", "steady"):
                 own = [row for row in found.window_rows if (row.observer, row.window) == (observer, name)]
                 own.sort(key=lambda row: row.ratio_to_bound_ancestors)
-                for row in (own[len(own) // 2], own[-1]):
-                    cells.append(in_parentheses(row.ratio_to_bound_ancestors, row.ratio_to_bound_ancestors_se))
+                ratios = [(row.ratio_to_bound_ancestors, row.ratio_to_bound_ancestors_se) for row in own]
+                cells.append(_both(ratios[len(ratios) // 2], ratios[-1]))
             own.sort(key=lambda row: row.anees)
-            cells += [in_parentheses(row.anees, row.anees_se) for row in (own[0], own[-1])]
+            cells.append(_both(*((row.anees, row.anees_se) for row in (own[0], own[-1]))))
             rows.append([f"`{scene}`", f"`{observer}`", *cells])
             print(" | ".join(rows[-1]), file=sys.stderr, flush=True)
-    heads = ["scene", "observer", "5-10 s: median", "worst", "after 35 s: median", "worst", "ANEES: least", "largest"]
-    return table(heads, rows)
+    return table(["scene", "observer", "5-10 s: median, worst", "after 35 s", "ANEES: least, largest"], rows)
+
+
+def _both(first: tuple[float, float], second: tuple[float, float]) -> str:
+    return f"{in_parentheses(*first)}, {in_parentheses(*second)}"
 
 
 def undeclared(seeds: Sequence[int], jobs: int) -> str:
     """Return the table of errors that the scenario does not declare: mean RMSE, worst error, m, and largest ANEES."""
-    rows = []
+    rows, heads = {name: [name] for name in CHANGES}, ["error"]
     for scene, scenario in (("tracking", tracking()), ("road", road())):
         recordings = {seed: record(scenario, seed) for seed in seeds}
+        heads += [f"{scene}: `{observer}`" for observer in CHANGED_OBSERVERS]
         for name, fault in CHANGES.items():
-            cells = []
             for observer in CHANGED_OBSERVERS:
                 found = outcome(recordings, fault, observer, JUDGED_FROM)
-                cells += [found.mean, f"{found.error.max():.2g}", _compact(found.anees.mean(axis=0).max())]
-            rows.append([scene, name, *cells])
-            print(" | ".join(rows[-1]), file=sys.stderr, flush=True)
-    heads = [head for observer in CHANGED_OBSERVERS for head in (f"`{observer}`", "worst", "ANEES")]
-    return table(["scene", "error", *heads], rows)
+                anees = _compact(found.anees.mean(axis=0).max())
+                rows[name].append(f"{found.mean}, {found.error.max():.2g} ({anees})")
+            print(" | ".join(rows[name]), file=sys.stderr, flush=True)
+    return table(heads, list(rows.values()))
 
 
 def merged(seeds: Sequence[int], jobs: int) -> str:
-    """Return the table of the merging platoons: RMSE of a vehicle, worst error, m, and shares of vehicle ticks, %."""
+    """Return the table of the merging platoons: mean and median RMSE, worst error, m; shares of vehicle ticks, %."""
     rows, recordings = [], {seed: record(merging(), seed) for seed in seeds}
     for name, fault in MERGING_CHANGES.items():
+        cells = []
         for observer in CHANGED_OBSERVERS:
             found = outcome(recordings, fault, observer, MERGING_FROM)
-            size = [f"{np.median(found.rmse):.2g}", f"{found.error.max():.2g}"]
-            rows.append([name, f"`{observer}`", found.mean, *size, found.overconfident, found.exceeded])
-            print(" | ".join(rows[-1]), file=sys.stderr, flush=True)
-    return table(["error", "observer", "mean", "median", "worst", "overconfident, %", "level exceeded, %"], rows)
+            cells += [f"{found.mean}, {np.median(found.rmse):.2g}, {found.error.max():.2g}", found.overconfident]
+        rows.append([name, *cells, found.exceeded])
+        print(" | ".join(rows[-1]), file=sys.stderr, flush=True)
+    heads = [head for observer in CHANGED_OBSERVERS for head in (f"`{observer}`", "overconfident")]
+    return table(["error", *heads, "level exceeded"], rows)
 
 
 def levels(seeds: Sequence[int], jobs: int) -> str:
