@@ -183,12 +183,13 @@ def evaluate(act: Callable[[Tensor], Tensor], args: Arguments) -> dict[str, floa
     )
     observation, _ = env.reset(seed=coopenv.evaluation_seed(0))
     tally = Tally(env.num_envs, args.device, env.engine.reward_terms)
-    over = torch.zeros(env.num_envs, dtype=torch.bool, device=args.device)
+    acting = torch.as_tensor(env.acting, device=args.device)
+    over = torch.zeros_like(acting)
     for _ in range(round(env.scenario.horizon * env.scenario.rates.decision)):
         with torch.no_grad():
             action = act(observation)
         observation, reward, terminated, truncated, infos = env.step(action)
-        tally.add(reward, infos["alive"] & ~over, terminated | truncated, infos)
+        tally.add(reward, acting & infos["alive"] & ~over, terminated | truncated, infos)
         over |= terminated | truncated
     return tally.read()
 
@@ -237,14 +238,14 @@ def collect(
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Return a rollout, (rollout, rows, ...) per entry, and the value of the observation after it."""
     steps: list[dict[str, Tensor]] = []
-    std = policy.log_std.exp()
+    std, acting = policy.log_std.exp(), torch.as_tensor(env.acting, device=args.device)
     for _ in range(args.rollout):
         raw = now["observation"].clone()  # the environment writes the next one into the same memory
         observation = policy.normaliser(raw)
         mean = policy.actor(observation)
         action = mean + std * torch.randn_like(mean)
         now["observation"], reward, terminated, truncated, infos = env.step(action)  # clips the action
-        valid = infos["alive"] & ~now["done"]  # not parked, and not the step that reset the world
+        valid = acting & infos["alive"] & ~now["done"]  # not parked, and not the step that reset the world
         now["done"] = terminated | truncated
         steps.append(
             {

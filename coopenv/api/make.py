@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorEnv
 
 from coopenv.api.arguments import RewardFunction
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
-from coopenv.api.vector_env import ArrayKind, CooperativeVectorEnv
+from coopenv.api.vector_env import ActingRows, ArrayKind, CooperativeVectorEnv
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import open_backend, open_simulation
 from coopenv.base.errors import CoopenvError, explained
@@ -146,19 +146,22 @@ def make_rows(
     name_or_path: ScenarioLike,
     num_envs: int = 1,
     vectorization_mode: Literal["vector_entry_point"] | None = None,
+    acting: bool = False,
     **options: Any,
-) -> CooperativeVectorEnv:
-    """Entry point of `gymnasium.make_vec("coopenv/...", num_envs=rows)`.
+) -> VectorEnv[Any, Any, Any]:
+    """Entry point of `gymnasium.make_vec("coopenv/...", num_envs=rows)`; `acting`: rows are those of `ActingRows`.
 
     Raises:
         CoopenvError: `num_envs` is not a multiple of the vehicles.
     """
     if "num_worlds" in options:
         raise CoopenvError("give num_envs, which counts rows (world, vehicle), instead of num_worlds")
-    vehicles = len(open_simulation(name_or_path, options.get("overrides")).vehicles)
-    if not isinstance(num_envs, int | np.integer) or num_envs < 1 or num_envs % vehicles:
+    acts = open_simulation(name_or_path, options.get("overrides")).acting
+    vehicles = acts.count(True) if acting else len(acts)
+    if not isinstance(num_envs, int | np.integer) or num_envs < 1 or num_envs % max(1, vehicles):
         raise CoopenvError(
-            f"num_envs counts rows (world, vehicle): {num_envs} is not a positive multiple of the {vehicles} vehicles "
-            f"of {name_or_path}"
+            f"num_envs counts rows (world, vehicle): {num_envs} is not a positive multiple of the {vehicles} "
+            f"{'acting ' if acting else ''}vehicles of {name_or_path}"
         )
-    return make_vec(name_or_path, num_worlds=int(num_envs) // vehicles, **options)
+    env = make_vec(name_or_path, num_worlds=int(num_envs) // max(1, vehicles), **options)
+    return ActingRows(env) if acting else env

@@ -53,8 +53,10 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
       `infos["final_obs"]` and `infos["final_info"]`, with masks `infos["_final_obs"]` and `infos["_final_info"]`.
     - DISABLED: nothing happens before `reset(options={"reset_mask": mask})`, which takes whole worlds.
 
-    Every reset draws anew. On the CPU results are fresh NumPy arrays; on CUDA they are torch tensors that share the
-    environment's memory, valid until the next step, and `step` does not synchronise with the host.
+    `acting` marks the rows whose actions count: a vehicle with a driver or a prescribed motion ignores those of its
+    row. `ActingRows` shows the marked rows alone. Every reset draws anew. On the CPU results are fresh NumPy arrays; on
+    CUDA they are torch tensors that share the environment's memory, valid until the next step, and `step` does not
+    synchronise with the host.
     """
 
     def __init__(
@@ -79,6 +81,8 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.scenario = scenario = self.engine.backend.scenario
         self.num_worlds, self.vehicles = self.engine.world.worlds, len(scenario.vehicles)
         self.num_envs = self.num_worlds * self.vehicles
+        self.acting = np.tile(scenario.acting, self.num_worlds)
+        """(num_envs,) bool: whether actions drive the row's vehicle."""
         modes = {word.lower(): mode for mode in AutoresetMode for word in (mode.name, mode.value)}
         word = str(getattr(autoreset, "name", autoreset)).lower().replace("-", "_")
         check_one_of("unknown autoreset", word, modes)
@@ -313,6 +317,40 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Close the renderer and end the threads."""
         if hasattr(self, "engine"):
             self.engine.close()
+
+
+class ActingRows(VectorWrapper):
+    """Shows the rows of vehicles that actions drive alone, with infos; flat observations only."""
+
+    def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
+        """Wrap a batch with NumPy arrays, or one wrapped already. Raises CoopenvError: no vehicle acts."""
+        super().__init__(env)
+        self._acting: np.ndarray = env.unwrapped.acting  # type: ignore[attr-defined]
+        if not self._acting.any():
+            raise CoopenvError("all motion is prescribed or has a driver, there is nothing to drive")
+        self.observation_space = batch_space(env.single_observation_space, self.num_envs)
+        self.action_space = batch_space(env.single_action_space, self.num_envs)
+
+    @property
+    def num_envs(self) -> int:
+        """Number of rows, those of the acting vehicles of all worlds."""
+        return int(self._acting.sum())
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the batch."""
+        observations, infos = self.env.reset(seed=seed, options=options)
+        return self._own(observations), self._own(infos)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step the batch under actions (num_envs, A)."""
+        size = self.action_space.shape[-1]  # type: ignore[index]
+        whole = np.zeros((len(self._acting), size), dtype=np.float32)
+        whole[self._acting] = host_actions(actions, (self.num_envs, 1, size))[:, 0]
+        observations, rewards, terminated, truncated, infos = self.env.step(whole)
+        return *map(self._own, (observations, rewards, terminated, truncated)), self._own(infos)
+
+    def _own(self, rows: Any) -> Any:
+        return {name: self._own(each) for name, each in rows.items()} if isinstance(rows, dict) else rows[self._acting]
 
 
 class TrueEnds(VectorWrapper):

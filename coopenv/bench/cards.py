@@ -121,8 +121,9 @@ class Contest:
         if worlds < 1:
             raise CoopenvError(f"worlds must be at least 1, got {worlds}")
         scenario, name = open_simulation(environment, overrides), scenario_name(environment)
-        if not scenario.driven:
-            raise CoopenvError(f"{name}: all motion here is prescribed, there is nothing to drive")
+        if not any(scenario.acting):
+            why = "every driven vehicle has a driver" if scenario.driven else "all motion here is prescribed"
+            raise CoopenvError(f"{name}: {why}, there is nothing to drive")
         found = [find_agent(text) for text in agents or agents_for(name)]
         if not found:
             raise CoopenvError(f"no agent of agents/ was made for {name}; name some with --agents A,B")

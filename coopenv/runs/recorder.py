@@ -23,7 +23,7 @@ from coopenv.base.files import check_new, replace_text, replacing_folder, writin
 from coopenv.base.installation import environment, environment_id, install_command, needing, version
 from coopenv.estimation.observability import Trajectory
 from coopenv.estimation.poses import quaternion_wxyz
-from coopenv.evaluation.episodes import Views, driven_vehicles, play
+from coopenv.evaluation.episodes import Views, play
 from coopenv.observers.mailbox import Interference, interference_of, stacked
 from coopenv.observers.recording import MEASURED, Drawn, Recording, Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
@@ -146,10 +146,10 @@ def drive_vehicles(
     worlds: int,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> list[DrivenEpisode]:
-    """Let a policy drive an episode in every world of a seed; return one per driven vehicle that is there.
+    """Let a policy drive an episode in every world of a seed; return one per acting vehicle that is there.
 
     Args:
-        scenario: has driven vehicles.
+        scenario: has acting vehicles.
         policy: chooses for all rows, (world, vehicle).
         seed: of the batch, as of `make_vec(...).reset(seed=...)`.
         worlds: how many.
@@ -158,8 +158,8 @@ def drive_vehicles(
     Raises:
         CoopenvError: nothing is driven, or the policy returns something else than actions.
     """
-    if not scenario.driven:
-        raise CoopenvError("all motion here is prescribed, there is nothing to drive")
+    if not any(scenario.acting):
+        raise CoopenvError("all motion here is prescribed or has a driver, there is nothing to drive")
     engine = Engine(scenario, worlds)
     kept, ticks = Views(engine, KEPT), scenario.horizon_ticks
     for tick in play(engine, seed, ticks, policy, False, stride=scenario.ticks_per_decision):
@@ -170,7 +170,7 @@ def drive_vehicles(
     engine.close()
     observations, actions, rewards, terminated, truncated, errors = (kept[name] for name in KEPT)
     driven, ended, episodes = actions[1:], ((terminated + truncated) > 0)[1:], []
-    for world, vehicle in product(range(worlds), driven_vehicles(scenario)):
+    for world, vehicle in product(range(worlds), np.flatnonzero(scenario.acting)):
         if not there[world, vehicle]:
             continue
         length = int(next(iter(np.flatnonzero(ended[:, world, vehicle])), len(driven) - 1)) + 1

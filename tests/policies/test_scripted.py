@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 import coopenv
+from coopenv.api.make import make_rows
 from coopenv.base.errors import CoopenvError
 from coopenv.policies import decide, load_agent, restart
+from coopenv.runs.recorder import drive_vehicles
 from coopenv.scenario import load_scenario
 
 DRIVER = "stop_when_lost"  # it has a memory
@@ -65,6 +69,47 @@ def test_rows_with_a_driver_are_not_learned_from() -> None:
         assert env.acted[0] or step
         done += dones
     assert done.tolist() == [1, 0, 0, 1, 0, 0]
+
+
+def test_batches_mark_the_rows_that_act_and_show_these_alone() -> None:
+    options = {"overrides": {**FOLLOWERS, **SHORT}}
+    whole = coopenv.make_vec("scout_platoon", num_worlds=2, **options)
+    assert whole.acting.tolist() == [True, False, False] * 2
+    own = make_rows("scout_platoon", 2, acting=True, **options)
+    assert own.num_envs == 2 and own.action_space.shape == (2, 2) == own.action_space.sample().shape
+    for ours, theirs in zip(own.reset(seed=3), whole.reset(seed=3), strict=True):
+        assert_rows(ours, theirs, whole.acting)
+    actions = np.full((6, 2), 0.5)
+    for _ in range(70):  # beyond the end of an episode
+        for ours, theirs in zip(own.step(actions[whole.acting]), whole.step(actions), strict=True):
+            assert_rows(ours, theirs, whole.acting)
+    with pytest.raises(CoopenvError, match="2 is not a positive multiple of the 3 vehicles"):
+        make_rows("scout_platoon", 2, **options)
+    with pytest.raises(CoopenvError, match="there is nothing to drive"):
+        make_rows("busy_intersection", 5, acting=True)
+
+
+def assert_rows(ours: Any, theirs: Any, acting: np.ndarray) -> None:
+    if isinstance(theirs, dict):
+        assert [*ours] == [*theirs]
+        for name in theirs:
+            assert_rows(ours[name], theirs[name], acting)
+    else:
+        assert np.array_equal(ours, theirs[acting], equal_nan=True)
+
+
+def test_a_dataset_holds_episodes_of_acting_vehicles_alone() -> None:
+    scenario = load_scenario("scout_platoon", {**FOLLOWERS, "horizon": 1.0})
+    episodes = drive_vehicles(scenario, load_agent("peek", scenario), 0, 2)
+    assert [episode.vehicle for episode in episodes] == ["vehicle_1"] * 2
+
+
+def test_an_evaluation_needs_a_vehicle_that_acts() -> None:
+    with pytest.raises(
+        CoopenvError, match="scout_platoon: every driven vehicle has a driver, there is nothing"
+    ) as caught:
+        coopenv.evaluate("scout_platoon", "peek", 2, overrides={"vehicles.*.motion.driver": "constant_speed"})
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

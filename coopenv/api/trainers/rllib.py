@@ -63,7 +63,7 @@ class CooperativeMultiAgentEnv(MultiAgentEnv):
 
 
 class CooperativeRows(VectorWrapper):
-    """A batch as a vector environment of RLlib: rows (world, vehicle) for one policy that all vehicles share.
+    """A batch as a vector environment of RLlib: rows (world, acting vehicle) for one policy that they share.
 
         config = (
             PPOConfig()
@@ -78,8 +78,8 @@ class CooperativeRows(VectorWrapper):
         """Build the batch.
 
         Args:
-            config: `env`: name or TOML file; `num_envs`: rows, a multiple of the vehicles, given by RLlib; the other
-                entries are options of `coopenv.make_vec`.
+            config: `env`: name or TOML file; `num_envs`: rows, a multiple of the acting vehicles, given by RLlib; the
+                other entries are options of `coopenv.make_vec`.
 
         Raises:
             CoopenvError: RLlib was not asked for one vector environment.
@@ -87,7 +87,7 @@ class CooperativeRows(VectorWrapper):
         options = dict(config)
         if "num_envs" not in options:
             raise CoopenvError("CooperativeRows needs env_runners(gym_env_vectorize_mode='vector_entry_point')")
-        super().__init__(TrueEnds(make_rows(options.pop("env", "urban_crossing"), **options)))
+        super().__init__(TrueEnds(make_rows(options.pop("env", "urban_crossing"), acting=True, **options)))
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         return self.env.reset(seed=seed, options=options)[0], {}

@@ -70,11 +70,11 @@ class CooperativeSB3VecEnv(VecEnv):
         self.scenario, self.vehicles = envs.scenario, envs.vehicles
         self.render_mode, self.metadata = "rgb_array", envs.metadata
         self.acted = np.zeros(envs.num_envs, dtype=bool)
-        """(num_envs,) whether the row's vehicle was under way in the last step, and no script drives it."""
+        """(num_envs,) whether the row's vehicle was under way in the last step, and acts (any, where none does)."""
         self.batch_infos: dict[str, Any] = {}
         """Infos of the last step as `CooperativeVectorEnv` gives them, arrays (num_envs,)."""
         self._recorder = RecordVehicleEpisodes(envs)
-        self._unscripted = np.tile([driver is None for driver in envs.scenario.drivers], envs.num_worlds)
+        self._rows = envs.acting if envs.acting.any() else ~envs.acting
         self._outcomes, self._begin = outcome_words(envs.scenario), time.time()
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
@@ -128,8 +128,8 @@ class CooperativeSB3VecEnv(VecEnv):
         """
         observation, rewards, _, truncated, after = self._recorder.step(self._actions)
         self.batch_infos = step = after.get("final_info", after)
-        self.acted = step["alive"] & self._unscripted
-        dones = after.get("_episode", np.zeros(self.num_envs, dtype=bool)) & self._unscripted
+        self.acted = step["alive"] & self._rows
+        dones = after.get("_episode", np.zeros(self.num_envs, dtype=bool)) & self._rows
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for row in np.flatnonzero(dones).tolist():
             episode, final = after["episode"], after["final_obs"]
