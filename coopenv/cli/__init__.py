@@ -84,6 +84,10 @@ def describe(given: DescribeOptions) -> None:
         scenario, recorded = options.load(given.environment, given.changes), False
         if scenario.cosimulator is not None and not scenario.roads:  # they are those of the program
             scenario = simulation_of(scenario).scenario
+        if any(scenario.drivers):
+            from coopenv.policies.loader import ScriptedVehicles
+
+            ScriptedVehicles(scenario)  # refuses agents that cannot drive
     if given.as_json:
         options.print_json(document(name, scenario))
         return

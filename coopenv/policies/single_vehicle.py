@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -11,7 +12,7 @@ import numpy as np
 
 from coopenv.api.make import parallel_env
 from coopenv.api.parallel_env import RENDER_MODES, CooperativeLocalisationEnv
-from coopenv.base.errors import CoopenvError, check_one_of
+from coopenv.base.errors import CoopenvError, check_one_of, shown
 from coopenv.policies.base import Policy, decide, restart, zero_policy
 from coopenv.policies.loader import load_agent
 from coopenv.scenario import Scenario, ScenarioLike
@@ -24,6 +25,9 @@ MOST_EPISODES = 1000
 
 def driver_of(others: str | Policy | None, scenario: Scenario) -> Policy:
     """Return what `load_agent` does, for None `route_follower`, or straight on where that cannot drive."""
+    if not (others is None or isinstance(others, str | Path) or callable(others) or hasattr(others, "predict")):
+        expected = "expected one agent for all other vehicles, a name, a folder, file.py:Class or a policy"
+        raise CoopenvError(f"others: {expected}, got {shown(others)}")
     try:
         return load_agent("route_follower" if others is None else others, scenario)
     except CoopenvError:

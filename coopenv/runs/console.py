@@ -48,7 +48,7 @@ class Progress:
         """
         self._drawn = log.is_terminal and log.file.isatty()  # notebooks ask for colours and are no terminal
         self._log, self._description, self._total, self._completed = log, description, total, 0.0
-        self._rate, self._hinted = rate, False
+        self._rate, self._hinted, self._waiting = rate, False, True
         self._first: tuple[float, float] | None = None
         """When the first parts were done, s, and how much they were; compiling may have made them slow."""
         self._burst = inf
@@ -75,8 +75,9 @@ class Progress:
     def update(self, completed: float, description: str | None = None) -> None:
         """Say how much is done, and what is being done now; time counts from a first word that nothing is done yet."""
         now = monotonic()
-        if completed == 0.0 and self._completed == 0.0:
+        if completed == 0.0 and self._waiting:
             self._begin = now
+        self._waiting = False
         if completed > 0.0 and now < self._burst:
             self._burst = min(self._burst, now + 0.25 * (now - self._begin))
             self._first = now, completed

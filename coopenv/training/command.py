@@ -81,9 +81,15 @@ def possible(plan: TrainingPlan) -> Scenario:
     scenario = open_simulation(plan.environment, plan.all_overrides)
     if not any(scenario.acting):
         raise CoopenvError(f"{plan.environment}: all motion is prescribed or has a driver, there is nothing to learn")
-    for each, _ in (pair for own in plan.watched() for pair in own.scenarios()):
-        if plan.settings.clone is not None:
-            load_agent(plan.settings.clone.agent, each)
+    for own in plan.watched():
+        try:
+            for each, _ in own.scenarios():
+                if plan.settings.clone is not None:
+                    load_agent(plan.settings.clone.agent, each)
+        except CoopenvError as error:
+            if own is plan:
+                raise
+            raise CoopenvError(f"clone.elsewhere: {own.environment}: {error}") from None
     return scenario
 
 

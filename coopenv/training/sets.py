@@ -68,11 +68,11 @@ class SetTrainer:
         """The weights, float32."""
         self.seen: dict[str, tuple[float, float]] = {}
         """Between which values the constants of the training lay."""
-        worlds = [pair for own in plan.watched() for pair in own.scenarios(clone.episodes)]
+        worlds = [(own.environment, *pair) for own in plan.watched() for pair in own.scenarios(clone.episodes)]
         try:
             self.mean_action = SetDriver(scenario, self.tensors)
             """The driver in the environment that it is judged in; with weights after `begin`."""
-            self._worlds = [(each, count, SetDriver(each, {})) for each, count in worlds]
+            self._worlds = [(name, each, count, SetDriver(each, {})) for name, each, count in worlds]
         except ValueError as error:
             raise CoopenvError(f"network: {error}") from None
         self.seconds, self.cpu_seconds = 0.0, 0.0
@@ -80,7 +80,10 @@ class SetTrainer:
     def begin(self, report: Callable[[str], None]) -> None:
         """Watch the planner and learn its steering."""
         begin, cpu_begin = monotonic(), process_time()
-        watched = [self._watched(*own, APART * place, report) for place, own in enumerate(self._worlds)]
+        watched = []
+        for place, (name, *own) in enumerate(self._worlds):
+            title = f"{name} ({place + 1} of {len(self._worlds)}): "
+            watched.append(self._watched(*own, APART * place, lambda line, title=title: report(title + line)))
         alone, *rest = (_joined(parts) for parts in zip(*watched, strict=True))
         std = alone.std(axis=0)
         scales = {"mean": alone.mean(axis=0), "std": np.where(std > 1e-4 * np.abs(alone).max(axis=0), std, UNSEEN)}

@@ -88,6 +88,11 @@ def test_an_environment_prints_copies_pickles_and_closes() -> None:
     env.reset(seed=3)
 
 
+def test_an_observation_without_an_entry_is_refused() -> None:
+    with pytest.raises(coopenv.CoopenvError, match=r"^observation.include: seen without an entry here; add a group"):
+        coopenv.parallel_env("facade", overrides={"observation.include": ["seen"]})
+
+
 def test_a_state_whose_lists_never_end_is_refused() -> None:
     env = coopenv.parallel_env(ENV)
     env.reset(seed=0)

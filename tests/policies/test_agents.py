@@ -297,6 +297,8 @@ def test_others_are_an_agent_or_a_policy() -> None:
     assert not np.array_equal(peek["vehicle_2"], straight["vehicle_2"])
     with pytest.raises(coopenv.CoopenvError, match=r"unknown agent 'peak' \(did you mean 'peek'\?\)"):
         SingleVehicleEnv("urban_crossing", others="peak")
+    with pytest.raises(coopenv.CoopenvError, match=r"^others: expected one agent for all other vehicles"):
+        SingleVehicleEnv("urban_crossing", others={"vehicle_1": "peek"})
 
 
 @pytest.mark.parametrize("key", ["action.pan", "action.longitudinal"])

@@ -13,6 +13,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.policies import decide, load_agent, restart
 from coopenv.runs.recorder import drive_vehicles
 from coopenv.scenario import load_scenario
+from tests.helpers.commands import refused
 
 DRIVER = "stop_when_lost"  # it has a memory
 FOLLOWERS = {f"vehicles.vehicle_{i}.motion.driver": DRIVER for i in (2, 3)}
@@ -123,6 +124,11 @@ def test_drivers_that_are_not_possible(changes: dict[str, str], message: str) ->
     with pytest.raises(CoopenvError, match=message) as caught:
         coopenv.parallel_env("scout_platoon", overrides=changes)
     assert "\n" not in str(caught.value)
+
+
+def test_a_description_refuses_an_unknown_driver() -> None:
+    line = refused("describe", "open_square", "--set", "vehicles.vehicle_2.motion.driver=nobody")
+    assert "vehicles.1.motion.driver: unknown agent 'nobody'; known: " in line
 
 
 def test_a_prescribed_motion_takes_no_driver() -> None:

@@ -74,6 +74,17 @@ def test_processes_that_finish_together_are_one_part(text: io.StringIO, monkeypa
         assert progress.line() == "comparing: 20 % after 120 s, about 480 s left"
 
 
+def test_time_counts_from_the_first_word(text: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [100.0]
+    monkeypatch.setattr(module, "monotonic", lambda: clock[0])
+    progress = Progress(Console(file=text), "starting", total=1.0)
+    progress.__enter__()
+    for clock[0] in (103.0, 110.0):
+        progress.update(0.0, "watching peek")
+    assert progress.line() == "watching peek: 7 s"
+    progress.__exit__()
+
+
 def test_a_notebook_that_asks_for_colours_gets_lines(text: io.StringIO) -> None:
     with Progress(Console(file=text, force_terminal=True), "simulating"):
         wait_for(text, "simulating: ")

@@ -153,6 +153,14 @@ def landmarks(count: int) -> list[dict[str, Any]]:
             r"^vehicles.1.initial_pose: vehicle_2 starts in the place of vehicle_1: their boxes overlap \(and those of "
             r"2 more pairs\)$",
         ),
+        (
+            [
+                {"routes": [name], "motion": {"kind": "driven"}, "body": {"size": [0.6, 0.3, 0.3]}}
+                for name in ("a", "b")
+            ],
+            {"routes": [{"name": name, "waypoints": [[x, 0], [9, 0]]} for name, x in (("a", 0.0), ("b", 0.1))]},
+            "^vehicles.1.routes: vehicle_2 starts in the place of vehicle_1: their boxes overlap$",
+        ),
     ],
 )
 def test_a_doubtful_scenario_warns_once(

@@ -19,7 +19,7 @@ from coopenv.evaluation.episodes import play
 from coopenv.policies import find_agent, load_agent
 from coopenv.policies.loader import read_card
 from coopenv.policies.sets import CONSTANTS, Inputs, SavedSetDriver, SetDriver
-from coopenv.training.command import train
+from coopenv.training.command import Reports, train
 from coopenv.training.sets import SetNetwork
 from coopenv.training.settings import Clone, EvaluationSettings, Ppo, Settings, TrainingPlan
 
@@ -39,7 +39,12 @@ PLAN = TrainingPlan("facade", SETTINGS, 0)
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("sets") / "agent"
-    assert {result.metric for result in train(PLAN, out)} >= {"arrival_rate", "e95_m"}
+    lines: list[str] = []
+    found = train(PLAN, out, reports=Reports(cloning=lines.append))
+    assert {result.metric for result in found} >= {"arrival_rate", "e95_m"}
+    assert lines[0] == "behind_truck (1 of 2): watching look_ahead: 0 of 40 s"
+    assert "lighthouse (2 of 2): watching look_ahead: 0 of 40 s" in lines
+    assert lines[-2:] == [f"learning from look_ahead: pass {done} of 2" for done in (1, 2)]
     return out
 
 
@@ -133,6 +138,9 @@ def test_what_is_not_possible_is_refused(tmp_path: Path) -> None:
     clone = Clone(agent="look_ahead", elsewhere=("nowhere",))
     with pytest.raises(CoopenvError, match=r"network: the observation lacks last_action"):
         train(replace(PLAN, overrides={"observation.exclude": ["last_action"]}), tmp_path / "agent")
-    with pytest.raises(CoopenvError, match="nowhere"):
+    other = Clone(agent="look_ahead", elsewhere=("crossing_path", "nowhere"))
+    with pytest.raises(CoopenvError, match=r"clone\.elsewhere: crossing_path: agent .look_ahead. cannot be"):
+        train(replace(PLAN, settings=SETTINGS.model_copy(update={"clone": other})), tmp_path / "agent")
+    with pytest.raises(CoopenvError, match=r"clone\.elsewhere: nowhere: .*'nowhere'"):
         train(replace(PLAN, settings=SETTINGS.model_copy(update={"clone": clone})), tmp_path / "agent")
     assert not [*tmp_path.iterdir()]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError, check_one_of
+from coopenv.base.errors import CoopenvError, check_one_of, listed
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import Dynamics
 from coopenv.scenario.terms import GROUPS, OBSERVATION_FIELDS, SETTINGS, SETTINGS_OF_ACTIONS, ObservationField
@@ -146,6 +146,9 @@ def observation_layout(scenario: Scenario) -> Layout:
         group, low = row.group or name, float(row.low)
         layout[name] = Field(start, stop, shape, group, row.unit, scale, low, row.meaning, center)
         start = stop
+    if start == 0:
+        groups = listed(observation.include)
+        raise CoopenvError(f"observation.include: {groups} without an entry here; add a group such as 'estimate'")
     return Layout(layout, tuple(action_fields(scenario, limits) for limits in scenario.limits))
 
 
