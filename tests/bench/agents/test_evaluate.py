@@ -14,9 +14,10 @@ from PIL import Image
 
 import coopenv
 from coopenv.base.installation import data_directory
-from coopenv.bench.cards import shown
+from coopenv.bench.cards import shown, stress
 from coopenv.cli import main
 from coopenv.evaluation import METRICS
+from coopenv.scenario import load_scenario
 from tests.helpers.commands import refused
 
 SHORT = ["urban_crossing", "--worlds", "3", "--set", "horizon=1.0"]
@@ -69,6 +70,26 @@ def test_a_table_of_other_worlds(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     assert "still, a third of the landmarks" in out and "still, vehicle_1 lies" in out and "…" not in out
     assert "lies, share of the time under way" not in out
+    assert "\nscore: e95 [cm] of the fleet, the lower the better.\n" in out
+
+
+def test_stressed_worlds_differ_in_lens_mounting_landmarks_and_start() -> None:
+    rows = stress(load_scenario("open_square"))
+    worlds = {name: load_scenario("open_square", changes) for name, changes in rows.items()}
+    assert (
+        worlds["focal length x 0.6"].camera.focal_length[0]
+        < 130
+        < 310
+        < worlds["focal length x 1.5"].camera.focal_length[0]
+    )
+    assert worlds["mounting error 2 deg"].camera.extrinsics_error == pytest.approx(0.0349, abs=1e-4)
+    assert worlds["initial error x 3"].randomisation.factors("initial_error") == (3.0, 3.0)
+    boxes = {
+        name: [box.center for group in each.landmark_groups for box in group.boxes] for name, each in worlds.items()
+    }
+    assert np.allclose(boxes["landmarks 1.2 x as far out"], 1.2 * np.array(boxes["ideal sensing"]))
+    assert boxes["landmarks in one corner"] == boxes["ideal sensing"][:2]
+    assert "landmarks in one corner" not in stress(load_scenario("facade"))  # whose only strip has none
 
 
 def test_a_block_of_seeds_is_other_worlds(capsys: pytest.CaptureFixture[str]) -> None:
