@@ -38,15 +38,16 @@ def register_reward(name: str, function: Callable[..., Any], *, unit: str = "1",
 
     Args:
         name: an identifier.
-        function: of the record `Ego`, or of `Ego` and `Truth` (`coopenv.api.terms.records`); returns a number. A Warp
-            function, or a plain one that Warp can compile. A term that takes the truth is privileged.
+        function: of the record `Ego`, of `Ego` and `TruthRecord`, or of these and `FleetRecord`, the fleet's mean and
+            worst error and standard deviation (`coopenv.api.terms.records`); returns a number. A Warp function, or a
+            plain one that Warp can compile. A term that takes more than the first is privileged.
         unit: of the value.
         meaning: one line for tables; empty: the first line of the function's docstring.
 
     Raises:
-        CoopenvError: the name is no identifier or taken, or it is no function of one or two records.
+        CoopenvError: the name is no identifier or taken, or it is no function of one to three records.
     """
-    _register(REWARD_TERMS, Term, name, function, (1, 2), unit=unit, meaning=meaning)
+    _register(REWARD_TERMS, Term, name, function, (1, 2, 3), unit=unit, meaning=meaning)
 
 
 def register_termination(name: str, function: Callable[..., Any], *, meaning: str = "") -> None:
@@ -109,7 +110,7 @@ def _register(
     about = inspect.getdoc(getattr(function, "func", function)) or ""
     columns["meaning"] = columns["meaning"] or about.partition("\n")[0]
     if row is Term:
-        columns["privileged"] = records == 2
+        columns["privileged"] = records > 1
     try:
         kind.register(name, row(function=function, **columns))
     except ValidationError as error:

@@ -15,7 +15,7 @@ import warp as wp
 
 from coopenv.api.arguments import check_finite
 from coopenv.api.terms.layout import Layout, entries_of, included_fields, row_counts
-from coopenv.api.terms.records import Ego, MapLandmark, Neighbour, Target, TruthRecord
+from coopenv.api.terms.records import Ego, FleetRecord, MapLandmark, Neighbour, Target, TruthRecord
 from coopenv.api.terms.results import Records, write_records
 from coopenv.base import installation
 from coopenv.base.errors import CoopenvError
@@ -39,8 +39,8 @@ class OwnTerm(NamedTuple):
     title: str
     """Kind and name, for errors."""
     function: wp.Function
-    both: bool
-    """Whether it takes a second record."""
+    records: int
+    """How many it takes."""
     kernel: Callable[["OwnTerm"], wp.Kernel]
     place: int
     """First entry in the observation, place among the reward terms, or outcome of a condition."""
@@ -71,7 +71,7 @@ class OwnTerms:
         terms = [*_own_terms(scenario, layout)]
         self._terms = [term for term in terms if term.kernel is not condition_kernel]
         self._conditions = [term for term in terms if term.kernel is condition_kernel]
-        needed = {term.per for term in terms if term.kernel is field_kernel and term.both}
+        needed = {term.per for term in terms if term.kernel is field_kernel and term.records > 1}
         many = row_counts(scenario)
         self._many = {per: number if per in needed else 0 for per, number in many.items()}
         sizes = {"W": world.worlds, "N": model.vehicles if terms else 0}
@@ -143,7 +143,7 @@ class OwnTerms:
 @cache
 def field_kernel(term: OwnTerm) -> wp.Kernel:
     """Return the kernel of an observation field: one thread per (world, vehicle, target, neighbour or landmark)."""
-    function, both, many = term.function, term.both, term.size > 1
+    function, both, many = term.function, term.records > 1, term.size > 1
     returned = wp.types.vector(term.size, wp.float32) if many else wp.float32
     width, entries = len(term.entries), wp.types.vector(len(term.entries), wp.int32)(*term.entries)
 
@@ -170,10 +170,26 @@ def field_kernel(term: OwnTerm) -> wp.Kernel:
     return _kernel(apply)
 
 
+@wp.func
+def fleet_of(ego: wp.array(dtype=Ego), truth: wp.array(dtype=TruthRecord), alive: wp.array(dtype=wp.bool)):
+    """Return the figures of a world's vehicles under way from their records (N,)."""
+    fleet = FleetRecord()
+    for vehicle in range(ego.shape[0]):
+        if alive[vehicle]:
+            fleet.vehicles += 1
+            share = 1.0 / wp.float32(fleet.vehicles)
+            error, std = truth[vehicle].position_error, ego[vehicle].position_std
+            fleet.mean_error += share * (error - fleet.mean_error)
+            fleet.mean_std += share * (std - fleet.mean_std)
+            fleet.worst_error = wp.max(error, fleet.worst_error)
+            fleet.worst_std = wp.max(std, fleet.worst_std)
+    return fleet
+
+
 @cache
 def reward_kernel(term: OwnTerm) -> wp.Kernel:
     """Return the kernel of a reward term: one thread per (world, vehicle)."""
-    function, both = term.function, term.both
+    function, both, fleet = term.function, term.records > 1, term.records > 2
 
     def apply(
         ego: wp.array2d(dtype=Ego),
@@ -190,9 +206,14 @@ def reward_kernel(term: OwnTerm) -> wp.Kernel:
         world, vehicle = wp.tid()
         if chosen[world] == 0:
             return
-        value = wp.float32(
-            function(ego[world, vehicle], truth[world, vehicle]) if both else function(ego[world, vehicle])
-        )
+        if fleet:
+            value = wp.float32(
+                function(ego[world, vehicle], truth[world, vehicle], fleet_of(ego[world], truth[world], alive[world]))
+            )
+        else:
+            value = wp.float32(
+                function(ego[world, vehicle], truth[world, vehicle]) if both else function(ego[world, vehicle])
+            )
         terms[world, vehicle, place] = value
         if alive[world, vehicle] and fresh[world] == 0:
             reward[world, vehicle] = reward[world, vehicle] + weight * value
@@ -203,7 +224,7 @@ def reward_kernel(term: OwnTerm) -> wp.Kernel:
 @cache
 def condition_kernel(term: OwnTerm) -> wp.Kernel:
     """Return the kernel of a condition: one thread per (world, vehicle)."""
-    function, both = term.function, term.both
+    function, both = term.function, term.records > 1
 
     def apply(
         ego: wp.array2d(dtype=Ego),
@@ -240,22 +261,22 @@ def _own_terms(scenario: Scenario, layout: Layout) -> Iterator[OwnTerm]:
     rewards = REWARD_TERMS.known(scenario.reward.custom)
     for place, (name, weight) in enumerate(scenario.reward.by_name.items()):
         if name not in REWARD_TERMS.built_in:
-            bound = _bound(REWARD_TERMS, name, rewards.get(name), (1, 2))
-            if weight and bound[2] and not scenario.reward.privileged:
+            bound = _bound(REWARD_TERMS, name, rewards.get(name), (1, 2, 3))
+            if weight and bound[2] > 1 and not scenario.reward.privileged:
                 raise CoopenvError(f"{bound[0]} uses the truth: reward.privileged must be true")
             yield OwnTerm(*bound, reward_kernel, place, weight=weight)
     conditions = TERMINATION_CONDITIONS.known(scenario.termination.custom)
     for place, name in enumerate(scenario.termination.own, len(Outcome)):
         bound = _bound(TERMINATION_CONDITIONS, name, conditions.get(name), (1, 2))
-        if bound[2] and not scenario.termination.privileged:
+        if bound[2] > 1 and not scenario.termination.privileged:
             raise CoopenvError(f"{bound[0]} uses the truth: termination.privileged must be true")
         yield OwnTerm(*bound, condition_kernel, place, "true or false")
 
 
 def _bound(
     kind: Registry[Any], name: str, row: TermRow | None, records: tuple[int, ...]
-) -> tuple[str, wp.Function, bool]:
-    """Return title and function of a term, and whether it takes a second record."""
+) -> tuple[str, wp.Function, int]:
+    """Return title and function of a term, and how many records it takes."""
     title = f"{kind.kind} '{name}'"
     if row is None:
         raise CoopenvError(f"{title} is not registered in this process; see docs/terms.md")
@@ -266,9 +287,9 @@ def _bound(
             function = installation.load_reference(function)
         except CoopenvError as error:
             raise CoopenvError(f"{title}: {error}") from None
-    both = record_count(title, function, records) == 2
+    taken = record_count(title, function, records)
     try:
-        return title, _warp_function(function), both
+        return title, _warp_function(function), taken
     except RuntimeError as error:  # Warp reads the source, which a program of text does not have
         raise CoopenvError(f"{title}: {error}") from None
 

@@ -2,7 +2,8 @@
 
 Numbers are float32 in worlds of either precision. A field of the observation takes `Ego`, and `Target`, `Neighbour` or
 `MapLandmark`. These depend on the truth only through measurements, received messages and actions. Only reward terms and
-terminations may take `TruthRecord`, and are then privileged. Observations therefore cannot leak truth.
+terminations may take `TruthRecord`, reward terms `FleetRecord` too, and are then privileged. Observations therefore
+cannot leak truth.
 
 Values stand in the order of their rows in `coopenv.scenario.terms`, and in their units; the results kernel scales and
 clips them, or weighs them.
@@ -85,6 +86,17 @@ class TruthRecord:
     goal_distance: wp.float32  # m, horizontal
     progress: wp.float32  # decrease of the remaining route in this decision, m; 0 without a goal
     contact: wp.bool  # touching a building or another body now
+
+
+@wp.struct
+class FleetRecord:
+    """The vehicles of a world that were under way in this step, the vehicle itself among them; 0 without any."""
+
+    vehicles: wp.int32
+    mean_error: wp.float32  # m, of the position
+    worst_error: wp.float32  # m
+    mean_std: wp.float32  # m, of `Ego.position_std`
+    worst_std: wp.float32  # m
 
 
 @wp.struct

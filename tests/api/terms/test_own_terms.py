@@ -12,7 +12,7 @@ import pytest
 import warp as wp
 
 import coopenv
-from coopenv.api.terms.records import Ego, Target, TruthRecord
+from coopenv.api.terms.records import Ego, FleetRecord, Target, TruthRecord
 from coopenv.base.errors import CoopenvError, ScenarioError
 from coopenv.base.installation import scenario_path
 from coopenv.cli import main
@@ -48,6 +48,19 @@ def age_again(ego: Any, neighbour: Any) -> Any:
     return neighbour.age
 
 
+def worst_error(ego: Any, truth: Any, fleet: Any) -> Any:
+    return fleet.worst_error
+
+
+def spread(ego: Any, truth: Any, fleet: Any) -> Any:
+    return fleet.worst_std - fleet.mean_std
+
+
+@wp.func
+def under_way(ego: Ego, truth: TruthRecord, fleet: FleetRecord):
+    return fleet.vehicles
+
+
 def second_decision(ego: Any) -> Any:
     return ego.time > 0.15
 
@@ -61,6 +74,8 @@ def far_off(ego: Ego, truth: TruthRecord):
 def registered() -> None:
     coopenv.register_reward("error_again", error_again, unit="m")
     coopenv.register_reward("control_again", control_again)
+    for name, function in {"worst_error": worst_error, "spread": spread, "under_way": under_way}.items():
+        coopenv.register_reward(name, function)
     coopenv.register_observation("velocity_again", velocity_again, size=3, unit="m/s", scale="velocity_scale")
     coopenv.register_observation("bearing_again", bearing_again, per="target", size=3)
     coopenv.register_observation("age_again", age_again, per="neighbour", unit="s", scale="age_scale", low=0)
@@ -117,6 +132,26 @@ def test_conditions_of_ones_own_end_episodes(face: str) -> None:
     env.reset(seed=0)
     ended = [env.step(np.zeros(env.action_space.shape, np.float32))[4]["ended"].tolist() for _ in range(3)]
     assert ended == [[0] * 8, [len(Outcome)] * 8, [0] * 8]  # the first own outcome; then a new episode
+
+
+def test_a_reward_of_the_fleet_counts_the_vehicles_under_way() -> None:
+    weights = {f"reward.weights.{name}": 1.0 for name in ("worst_error", "spread", "under_way")}
+    short = {"horizon": 3.0, "termination.off_route": 0.3, "reward.privileged": True}
+    env = coopenv.make_vec("open_square", num_worlds=4, autoreset="disabled", overrides={**weights, **short})
+    env.reset(seed=0)
+    rng, fewer = np.random.default_rng(0), False
+    for _ in range(30):
+        *_, infos = env.step(rng.uniform(-1, 1, (16, 2)))
+        alive, error = (env.world_major(infos[name]) for name in ("alive", "position_error"))
+        terms = {name: env.world_major(values) for name, values in infos["reward_terms"].items()}
+        assert np.array_equal(terms["under_way"], np.broadcast_to(alive.sum(axis=1)[:, None], (4, 4)))
+        for world in np.flatnonzero(alive.any(axis=1)):
+            counted = error[world, alive[world]]
+            assert terms["worst_error"][world] == pytest.approx(counted.max(), rel=1e-4)
+            stds = env.engine.view("position_std")[world, alive[world]]
+            assert terms["spread"][world] == pytest.approx(stds.max() - stds.mean(), rel=1e-3, abs=1e-6)
+        fewer |= bool((alive.sum(axis=1) < 4).any())
+    assert fewer
 
 
 def test_conditions_that_are_off_and_terms_without_weight_cost_nothing() -> None:
@@ -218,7 +253,7 @@ def test_a_program_needs_one_file_for_a_reward_of_its_own(tmp_path: Path, capsys
         ("def eror(ego):\n    return 1.0\n", "no 'error' in .*my_terms.py .did you mean 'eror'"),
         ("error = 3\n", "expected a function with a name .*, got 3"),
         ("error = lambda ego: 1.0\n", "expected a function with a name"),
-        ("def error(ego, truth, more):\n    return 1.0\n", "takes 3 records, expected 1 or 2"),
+        ("def error(ego, truth, fleet, more):\n    return 1.0\n", "takes 4 records, expected 1 or 2 or 3"),
         ("def error(ego):\n    return ego.poistion\n", "cannot compile .* to return a number: .*poistion"),
         ("def error(ego):\n    return {1: ego.time}\n", "cannot compile .* to return a number: .*Dict"),
         ("def error(ego):\n    return ego.velocity\n", "cannot compile .* to return a number: .*vec3f"),
