@@ -137,7 +137,9 @@ def studied(name: str, scenario: Scenario) -> tuple[tuple[str, ...], dict[str, M
     if has_value_of_cooperation(name):
         learned = [agent for agent in agents_for(name) if agent == f"{name}_team"]
         return (*TEAM_DRIVERS, *learned), cooperation_settings(scenario)
-    return DRIVERS, {how: {"sensing": how} for how in SETTINGS}
+    shared = cooperation_settings(scenario) if sum(scenario.acting) > 1 else {}
+    shared.pop("as it is", None)  # equal to "sensed"
+    return DRIVERS, {how: {"sensing": how} for how in SETTINGS} | shared
 
 
 def contests(environment: str, scenario: Scenario, worlds: int) -> dict[str, Contest]:
@@ -201,12 +203,14 @@ def value_of_sensing_text(environment: str, scenario: Scenario, value: Mapping[s
     if "text" in value:
         note = "*The environment has changed since these figures were measured.*\n\n" if changed else ""
         return f"{note}{value['text']}"
+    rows = _rows(value)
     return rendered(
         "sensing.md.j2",
         environment=environment,
         team=has_value_of_cooperation(environment),
+        shared=any(how == "radio off" for how, _ in rows),
         drivers=studied(environment, scenario)[0],
-        rows=_rows(value),
+        rows=rows,
         worlds=value["worlds"],
         coopenv=value["coopenv"],
         changed=changed,

@@ -20,6 +20,7 @@ from coopenv.bench.pages import (
     fingerprint,
     index_text,
     is_measured,
+    studied,
     value_of_sensing_text,
 )
 from coopenv.cli import main
@@ -152,6 +153,14 @@ def made_up_value_of_sensing(scenario: Scenario) -> dict[str, object]:
         for how, who, metric in product(SETTINGS, DRIVERS, OVERVIEW)
     ]
     return {"coopenv": "1.2.3", "worlds": 2, "scenario": fingerprint(scenario), "rows": rows}
+
+
+def test_figures_of_cooperation_stand_where_several_vehicles_drive() -> None:
+    for name, several in (("open_square", True), ("behind_truck", False)):  # the truck is traffic
+        scenario = load_scenario(name)
+        assert ({"cars unseen", "radio off"} <= {*studied(name, scenario)[1]}) == several
+        page = (PAGES / f"{name}.md").read_text(encoding="utf-8")
+        assert ("## What sensing and cooperation are worth" in page) == ("| radio off | peek |" in page) == several
 
 
 def test_figures_that_are_older_than_the_environment_are_marked() -> None:
