@@ -73,7 +73,7 @@ def stress(scenario: Scenario) -> dict[str, dict[str, Any]]:
             "noise.odometry_scale": 0.03,
             "noise.gyro_bias": [0.0, 0.0, 0.0087],
         },
-        "initial error x 3": {"randomisation.initial_error": [3.0, 3.0]},
+        **{f"initial error x {by:g}": {"randomisation.initial_error": [by, by]} for by in (2.0, 3.0)},
         **{f"focal length x {by:g}": {"camera.focal_length": [by * f for f in camera.focal_length]} for by in lenses},
         "mounting error 2 deg": {"camera.extrinsics_error": math.radians(2.0)},
         **({f"landmarks {BACK:g} x as far out": back} if any(back.values()) else {}),
