@@ -332,7 +332,7 @@ class ActingRows(VectorWrapper):
         self.action_space = batch_space(env.single_action_space, self.num_envs)
 
     @property
-    def num_envs(self) -> int:
+    def num_envs(self) -> int:  # type: ignore[override]
         """Number of rows, those of the acting vehicles of all worlds."""
         return int(self._acting.sum())
 

@@ -81,9 +81,13 @@ class SetTrainer:
         """Watch the planner and learn its steering."""
         begin, cpu_begin = monotonic(), process_time()
         watched = []
-        for place, (name, *own) in enumerate(self._worlds):
+        for place, (name, each, count, driver) in enumerate(self._worlds):
             title = f"{name} ({place + 1} of {len(self._worlds)}): "
-            watched.append(self._watched(*own, APART * place, lambda line, title=title: report(title + line)))
+
+            def titled(line: str, title: str = title) -> None:
+                report(title + line)
+
+            watched.append(self._watched(each, count, driver, APART * place, titled))
         alone, *rest = (_joined(parts) for parts in zip(*watched, strict=True))
         std = alone.std(axis=0)
         scales = {"mean": alone.mean(axis=0), "std": np.where(std > 1e-4 * np.abs(alone).max(axis=0), std, UNSEEN)}
