@@ -24,7 +24,7 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.machine import machine
-from benchmarks.speed.__main__ import positive
+from benchmarks.options import at_least
 from coopenv import EVALUATION_SEEDS, load_scenario
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError, ScenarioWarning, check_one_of, world_keys
@@ -351,14 +351,14 @@ def report(results: dict[str, Any]) -> str:
 
 def numbers(text: str) -> list[int]:
     """Return numbers with commas between."""
-    return [positive(int)(part) for part in text.split(",") if part]
+    return [int(at_least(1)(part)) for part in text.split(",") if part]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, and write the results; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.city", description=__doc__)
     parser.add_argument("--observers", default=",".join(OBSERVERS), help="names with commas between; empty: none")
-    parser.add_argument("--worlds", type=positive(int), default=4, help="worlds per observer (default: 4)")
+    parser.add_argument("--worlds", type=at_least(1), default=4, help="worlds per observer (default: 4)")
     parser.add_argument("--sizes", type=numbers, default=list(SIZES), help="of vehicles, likewise")
     parser.add_argument("--out", type=Path, default=Path("out", "city"), help="folder (default: out/city)")
     parser.add_argument("--page", type=Path, help="folder of the environments' pages: nothing is measured")

@@ -25,7 +25,7 @@ from typing import Any
 
 import warp as wp
 
-from benchmarks.speed.__main__ import positive
+from benchmarks.options import at_least
 from coopenv.api.engine import Engine
 from coopenv.backends.feed import COSIMULATED, RECORDED
 from coopenv.base.errors import CoopenvError, shown
@@ -272,7 +272,7 @@ def parser() -> argparse.ArgumentParser:
         "--only", type=pattern, default="", metavar="PATTERN", help="modules whose names match a regular expression"
     )
     found.add_argument("--out", type=Path, default=Path("out", "cuda"), help="folder of the code (default: out/cuda)")
-    found.add_argument("--jobs", type=positive(int), default=os.cpu_count() or 1, help="modules at a time")
+    found.add_argument("--jobs", type=at_least(1), default=os.cpu_count() or 1, help="modules at a time")
     found.add_argument("--accept", action="store_true", help="make limits, and rows of the page's table, of this run")
     return found
 

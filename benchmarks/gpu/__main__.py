@@ -14,7 +14,7 @@ from typing import Any
 from benchmarks.gpu.plan import SIZES, Stage, plan
 from benchmarks.gpu.runner import failures, run
 from benchmarks.gpu.table import put, section
-from benchmarks.speed.__main__ import positive
+from benchmarks.options import at_least
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import check_file, writing
 from coopenv.base.installation import version
@@ -78,11 +78,9 @@ def parser() -> argparse.ArgumentParser:
     found = argparse.ArgumentParser(prog="python -m benchmarks.gpu", description=__doc__)
     found.add_argument("--device", default="cuda:0", help="cuda:0, ...; cpu tries the run itself (default: cuda:0)")
     found.add_argument(
-        "--worlds", type=positive(int), nargs="+", default=list(SIZES), help="whose throughput is measured"
+        "--worlds", type=at_least(1), nargs="+", default=list(SIZES), help="whose throughput is measured"
     )
-    found.add_argument(
-        "--minutes", type=positive(float), default=MINUTES, help=f"for everything (default: {MINUTES:g})"
-    )
+    found.add_argument("--minutes", type=at_least(0.1), default=MINUTES, help=f"for everything (default: {MINUTES:g})")
     found.add_argument("--only", default="", metavar="START", help="stages whose names begin so, such as throughput")
     found.add_argument("--code", type=Path, default=Path("out", "cuda"), help="of make cuda-check (default: out/cuda)")
     found.add_argument("--quick", action="store_true", help="as little as possible of everything")

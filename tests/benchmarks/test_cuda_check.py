@@ -158,7 +158,7 @@ def test_mistakes_are_one_line(
     assert capsys.readouterr().err.startswith("error: --accept needs both precisions and all architectures")
     for wrong, words in (
         (["--only", "("], "expected a regular expression, got '('"),
-        (["--jobs", "0"], "positive number"),
+        (["--jobs", "0"], "whole number of at least 1"),
     ):
         with pytest.raises(SystemExit):
             main(wrong)
