@@ -89,15 +89,19 @@ class Zenoh:
 def _sessions() -> WeakSet[Zenoh]:
     """Return the sessions of this process, which end with its main thread: Zenoh's own threads would keep it alive."""
     sessions: WeakSet[Zenoh] = WeakSet()
+    closing = threading.Lock()
 
     def close_all() -> None:
-        threading.main_thread().join()
-        for session in list(sessions):
-            session.close()
+        with closing:
+            for session in list(sessions):
+                session.close()
 
-    closing = threading.Thread(target=close_all, name="coopenv sessions", daemon=True)
-    closing.start()
-    atexit.register(closing.join)
+    def close_at_end() -> None:
+        threading.main_thread().join()
+        close_all()
+
+    threading.Thread(target=close_at_end, name="coopenv sessions", daemon=True).start()
+    atexit.register(close_all)  # waits for the thread, which the interpreter would stop within Zenoh
     return sessions
 
 
