@@ -91,7 +91,7 @@ LINES_AND_FILES = {
     "base": (1880, 10),
     "bench": (5423, 18),
     "cars": (10955, 39),
-    "cli": (2670, 8),
+    "cli": (2678, 8),
     "estimation": (1888, 7),
     "evaluation": (495, 3),
     "observers": (11725, 42),

@@ -129,6 +129,9 @@ class FilmOptions(SceneOptions):
     vehicle: Annotated[
         str | None, typer.Option(help="With --3d: vehicle that is followed, or whose camera it is (default: f1).")
     ] = None
+    headings: Annotated[
+        str | None, typer.Option(help="Headings of films side by side, with commas between (default: their names).")
+    ] = None
 
     def takes(self, log: "Console") -> "list[tuple[str, SceneRecord]]":
         """Return the scenes that stand side by side, each with what it differs in.
@@ -138,15 +141,20 @@ class FilmOptions(SceneOptions):
         """
         saved = self.saved()
         if saved is not None:
-            return [("", saved)]
+            return [(self.headings or "", saved)]
         observers: list[str | None] = [*options.words(self.observer)] or [None]
         agents: list[str | None] = [*options.words(self.agent)] or [None]
         pairs = [(observer, agent) for observer in observers for agent in agents]
-        takes = []
-        for observer, agent in pairs:
-            name = ", ".join(n for n, of in ((observer, observers), (agent, agents)) if n is not None and len(of) > 1)
-            takes.append((name, replace(self, observer=observer, agent=agent)._played(log)))
-        return takes
+        names = [
+            ", ".join(n for n, of in ((observer, observers), (agent, agents)) if n is not None and len(of) > 1)
+            for observer, agent in pairs
+        ]
+        if (headings := options.words(self.headings)) and len(headings) != len(pairs):
+            raise CoopenvError(f"--headings: expected one for each of {len(pairs)} films, got {len(headings)}")
+        return [
+            (name, replace(self, observer=observer, agent=agent)._played(log))
+            for name, (observer, agent) in zip(headings or names, pairs, strict=True)
+        ]
 
     def _played(self, log: "Console") -> "SceneRecord":
         from coopenv.runs.scenes import played_scene, title_of

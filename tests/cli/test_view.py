@@ -57,7 +57,10 @@ def test_a_run_can_be_watched_and_filmed(capsys: pytest.CaptureFixture[str]) -> 
 
 def test_several_films_stand_side_by_side(capsys: pytest.CaptureFixture[str]) -> None:
     command = ["film", *SHORT, "--observer", "riccati,mekf", "--fps", "2"]
-    assert main([*command, "--map-only", "--out", "above.webp"]) == 0
+    assert main([*command, "--map-only", "--headings", "one, another", "--out", "above.webp"]) == 0
+    assert "--headings: expected one for each of 2 films, got 1" in refused(
+        *command, "--headings", "x", "--out", "x.gif"
+    )
     pytest.importorskip("pyvista", reason="needs the extra film3d")
     space = ["--3d", "--camera", "overview,driver", "--width", "320", "--vehicle", "f2"]
     assert main([*command, *space, "--out", "space.webp"]) == 0
