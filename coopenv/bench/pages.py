@@ -303,8 +303,8 @@ GLANCE = ("Vehicles", "Targets", "Camera", "Odometry", "V2X", "Observer", "Rates
 """Facts that no table below repeats."""
 MOST_ROWS = 40
 """Of a table of vehicles, routes, landmarks or buildings."""
-TOLD = {"observation.include", "observation.scales", "observation.centers", "reward.privileged"}
-"""Settings that other tables tell, as they tell the weights."""
+SHOWN_ELSEWHERE = {"observation.include", "observation.scales", "observation.centers", "reward.privileged"}
+"""Settings that other tables show, as they show the weights."""
 
 
 def page_text(name: str, scenario: Scenario, measured: str = "", films: Iterable[str] = ()) -> str:
@@ -352,7 +352,7 @@ def _scene(scenario: Scenario) -> Iterator[str]:
         (f"`{section}.{key}`", value, meaning)
         for section in shown_sections(scenario)
         for key, value, meaning, differs in scenario_text.settings(getattr(scenario, section))
-        if differs and f"{section}.{key}" not in TOLD and not key.startswith("weights.")
+        if differs and f"{section}.{key}" not in SHOWN_ELSEWHERE and not key.startswith("weights.")
     ]
     yield table(("key", "value", "meaning"), rows)
 

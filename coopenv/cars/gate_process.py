@@ -124,8 +124,8 @@ class GateConnection:
         self._transport.publish(self._topics[role], payload, attachment, urgent=topic.urgent, reliable=topic.reliable)
 
 
-def tell_systemd(state: str) -> None:
-    """Tell systemd, where it has started this process, that it lives (`WATCHDOG=1`) or is ready (`READY=1`)."""
+def notify_systemd(state: str) -> None:
+    """Report to systemd, if it started this process: alive (`WATCHDOG=1`) or ready (`READY=1`)."""
     if place := os.environ.get("NOTIFY_SOCKET"):
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
             sender.sendto(state.encode(), "\0" + place[1:] if place.startswith("@") else place)
@@ -137,7 +137,7 @@ def run(link: GateConnection) -> None:
     systemd restarts a process that no longer ticks: `WatchdogSec`.
     """
     due = time.monotonic_ns()
-    tell_systemd("READY=1")
+    notify_systemd("READY=1")
     try:
         while True:
             wait = (due - time.monotonic_ns()) / 1e9
@@ -145,7 +145,7 @@ def run(link: GateConnection) -> None:
                 link.publish_status()
             elif wait <= 0.0 or time.monotonic_ns() >= due:
                 link.tick()
-                tell_systemd("WATCHDOG=1")
+                notify_systemd("WATCHDOG=1")
                 missed = max(time.monotonic_ns() - due, 0) // PERIOD
                 due += (missed + 1) * PERIOD
     finally:

@@ -225,15 +225,15 @@ def next_message(transport: "Transport", topic: str, kind: str, patience: float)
     from coopenv.cars.codec import decode
     from coopenv.cars.transport import Arrival
 
-    heard = Queue[Any](1)
+    received = Queue[Any](1)
 
     def keep(arrival: Arrival) -> None:
         with suppress(CoopenvError, Full):
-            heard.put_nowait(decode(arrival.payload, kind))
+            received.put_nowait(decode(arrival.payload, kind))
 
     transport.subscribe(topic, keep)
     with suppress(Empty):
-        return heard.get(timeout=patience)
+        return received.get(timeout=patience)
     return None
 
 
@@ -386,7 +386,7 @@ class SveaRunOptions:
     config: Annotated[Path, options.deployment(help="Which cars, and how they are reached.")]
     car: Annotated[
         str | None,
-        typer.Option(help="Estimate and drive this car alone and hear the others (default: all, as an edge server)."),
+        typer.Option(help="Estimate and drive only this car, receive from others (default: all, as an edge server)."),
     ] = None
     arm: Annotated[bool, typer.Option("--arm", help="Let the cars drive. Without it everything happens but that.")] = (
         False

@@ -148,8 +148,8 @@ def messages_of(records: Iterable[Any]) -> Iterator[tuple[Channel, Schema | None
 class Container:
     """An MCAP file in memory, read from begin to end; the index behind its data is not needed."""
 
-    def __init__(self, path: Path, forgiving: bool = False) -> None:
-        """Read a file; if `forgiving`, of one that is cut off what is whole.
+    def __init__(self, path: Path, truncated: bool = False) -> None:
+        """Read a file; if `truncated`, the whole records of one that is cut off.
 
         Raises:
             DataError: it is no MCAP file, or cut off; other errors are the library's.
@@ -160,7 +160,7 @@ class Container:
             raise DataError(f"{path}: not an MCAP file (it does not begin as one)")
         self.cut_off = is_cut_off(path)
         """Whether the end is missing."""
-        if self.cut_off and not forgiving:
+        if self.cut_off and not truncated:
             raise DataError(f"{path}: {CUT_OFF}; {MENDED}")
 
     def extras(self) -> tuple[dict[str, dict[str, str]], dict[str, bytes]]:

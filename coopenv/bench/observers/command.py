@@ -142,7 +142,7 @@ _COORDINATE = re.compile(r"(?<=[ML ])(-?\d+\.\d\d)\d+(?=[ \n])")
 
 
 def report_text(board: Leaderboard, content: Mapping[str, Any]) -> str:
-    """Return the report as one HTML text; `content` of `leaderboard.json` tells the command and versions."""
+    """Return the report as one HTML text; `content` of `leaderboard.json` has the command and versions."""
     variants = [_variant(board, name) for name in board.variants]
     nominal = variants[0]["name"] == NOMINAL
     values: dict[str, Any] = {

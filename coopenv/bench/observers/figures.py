@@ -192,7 +192,7 @@ def variant_figure(board: Leaderboard, variant: str, width: float | None = None)
 
 
 def cost_figure(board: Leaderboard, variant: str, width: float | None = None) -> Figure | None:
-    """Draw the mean position RMSE of a variant against the time of an update; the area tells the bytes sent.
+    """Draw the mean position RMSE of a variant against the time of an update; the area shows the bytes sent.
 
     None where every observer failed.
     """

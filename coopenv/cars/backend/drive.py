@@ -182,7 +182,7 @@ class Drive(TickGenerator):
 
         self._where = str(path)
         with reading(self._where):
-            container = Container(Path(path), forgiving=True)
+            container = Container(Path(path), truncated=True)
             metadata, attachments = container.extras()
         nothing = f"{path}: {f'{CUT_OFF}, and ' if container.cut_off else ''}no episode begins in it"
         if container.cut_off and ATTACHMENT not in attachments:

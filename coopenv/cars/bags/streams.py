@@ -130,8 +130,8 @@ def _of_sqlite3(path: Path, _: Allowance) -> Entries:
         for key, name, kind in database.execute("SELECT id, name, type FROM topics"):
             topics[key] = about = (name, kind, *texts.get(kind, ("", "")))
             yield about, 0, None
-        sound = "typeof(data) = 'blob' AND typeof(timestamp) = 'integer'"  # others are damaged
-        query = f"SELECT topic_id, timestamp, data FROM messages WHERE {sound} ORDER BY id"
+        valid = "typeof(data) = 'blob' AND typeof(timestamp) = 'integer'"  # others are damaged
+        query = f"SELECT topic_id, timestamp, data FROM messages WHERE {valid} ORDER BY id"
         for topic, received, data in database.execute(query):
             yield topics[topic], received, data
     finally:

@@ -145,7 +145,7 @@ class Fake:
             act(due, self._stamp(due) + self._faults.clock_error(due))
 
     def close(self) -> None:
-        """Tell the wheels to stand, and forget what is under way."""
+        """Stop the wheels, and discard the messages under way."""
         if self._link is not None:
             self._link.neutral()
         self._wire.close()
