@@ -27,7 +27,7 @@ from coopenv.world.embedded import Source, arrange_world, look_around, sense_not
 from coopenv.world.model import Precision
 from coopenv.world.nearby import NOT_A_NEIGHBOUR, sort_into_cells
 from coopenv.world.odometry import measure_odometry
-from coopenv.world.reset import begin_sensing, place_everybody, set_initial_estimate
+from coopenv.world.reset import begin_sensing, place_bodies, set_initial_estimate
 from coopenv.world.route import UNDER_WAY
 from coopenv.world.state import allocate, array, fields
 from coopenv.world.v2x import draw_faults, transmit
@@ -155,7 +155,7 @@ def rewind(model: Any, state: Any, record: Any, world: int):
         state.episode[world] = record.episode
         for k in range(record.parameter.shape[0]):
             state.parameter_set[world, k] = record.parameter[k]
-    place_everybody(model, state, world)
+    place_bodies(model, state, world)
     for vehicle in range(model.vehicles):
         forget_errors(state, world, vehicle)
         draw_faults(model, state, world, vehicle)
@@ -339,7 +339,7 @@ def renew_sample(model: Any, state: Any, motion: Any, world: int, vehicle: int, 
 @wp.func
 def begin_cosimulation(model: Any, state: Any, motion: Any, world: int):
     """Begin an episode where the vehicles stand; initial estimates are drawn as in the simulation."""
-    place_everybody(model, state, world)
+    place_bodies(model, state, world)
     for vehicle in range(model.vehicles):
         take_pose(model, state, motion, world, vehicle)
         agent = model.landmarks + vehicle

@@ -62,7 +62,7 @@ class Measurements:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensed(Measurements):
-    """What N vehicles sense at one tick; T targets, of which the first L are landmarks. Nobody can write to it.
+    """What N vehicles sense at one tick; T targets, of which the first L are landmarks. Read-only.
 
     Ticks are the frames of the scenario's camera rate, one after the other: tick k is due at k / rate. What a source
     has of a vehicle at that time is in its row; of a vehicle from which nothing came the row is not read.

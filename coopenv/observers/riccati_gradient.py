@@ -278,13 +278,13 @@ class DifferentiableWorld:
                 ScenarioWarning,
                 stacklevel=2,
             )
-        believed = belief.numpy()
+        estimated = belief.numpy()
         return DifferentiableRollout(
             float(total.numpy()[0]),
             np.stack([action.grad.numpy() for action in decisions]),
-            believed["covariance"],
+            estimated["covariance"],
             truth.numpy()["position"],
-            np.einsum("wnij,wnj->wni", believed["rotation"], believed["position"]),
+            np.einsum("wnij,wnj->wni", estimated["rotation"], estimated["position"]),
         )
 
     def _array(self, values: np.ndarray, dtype: Any) -> Any:

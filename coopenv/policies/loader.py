@@ -288,7 +288,7 @@ class ScriptedVehicles:
     def act(self, observations: np.ndarray, actions: np.ndarray) -> None:
         """Write the actions (W, N, A) of the scripted vehicles for observations (W, N, D).
 
-        A policy gets the rows of all vehicles, since the place of a row tells it which vehicle it drives.
+        A policy gets the rows of all vehicles, since the index of a row is that of the vehicle.
         """
         rows = observations.reshape(-1, observations.shape[-1]).copy()
         for driver, policy in self.policies.items():

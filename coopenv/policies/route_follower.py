@@ -241,7 +241,7 @@ class RouteFollower(Driver):
     def reported(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the senders of received messages, (rows, M), their places and directions, (rows, M, 2), own frame.
 
-        Where nobody can send there is one sender, from whom nothing is received.
+        Where no vehicle can send there is one sender, and no message from it.
         """
         if "message_mask" not in self.layout or 0 in self.layout["message_mask"].shape:
             none = np.zeros((len(observations), 1, 2))

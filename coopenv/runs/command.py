@@ -240,7 +240,7 @@ class Results(Tabular):
     Where nothing is known, as without motion capture: of all that were estimated, at all ticks, errors being NaN.
     """
     scenario: Scenario | None = None
-    """The world of the run; None where only its file could tell, such as of a recording."""
+    """The world of the run; None where only its file has it, such as a recording."""
     files: tuple[Path, ...] = ()
     """What was written."""
 

@@ -30,7 +30,7 @@ FULL_SPEED, FULL_STEERING = 1.0, 0.4
 
 
 class Keys:
-    """Which keys are held down, as the canvas of a window tells."""
+    """Keys that are held down in the window of a canvas."""
 
     def __init__(self, canvas: Any) -> None:
         """Listen to a canvas of matplotlib."""

@@ -188,7 +188,7 @@ RATES = (
     "frozen_rate_window_per_s",
     "frozen_rate_window_from_s",
 )
-"""Keys of the rates that theory tells."""
+"""Keys of the rates that theory predicts."""
 
 CARRIED_FOR = 1.0  # s at least, that an estimate is known for, before it counts as carried by odometry
 

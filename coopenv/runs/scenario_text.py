@@ -90,7 +90,7 @@ def start(vehicle: Vehicle) -> str:
 
 
 def estimate(belief: InitialEstimate) -> str:
-    """Return what the observer believes at t = 0, one line per fact."""
+    """Return the observer's estimate at t = 0, one line per fact."""
     angle = belief.orientation_angle
     return lines(
         "true position" if belief.position is None else vector(belief.position),

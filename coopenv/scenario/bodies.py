@@ -179,12 +179,12 @@ class InitialPose(Section):
 
 
 class InitialEstimate(Section):
-    """What the observer believes at t = 0, fixed or drawn anew at each reset."""
+    """The observer's estimate at t = 0, fixed or drawn anew at each reset."""
 
     position: Vector3 | None = None
     """Estimated position in the coordinates of this file, m (default: the true one; an override says so by `true`)."""
     position_offset: Vector3 = (0.0, 0.0, 0.0)
-    """Added to the believed position, map axes, m."""
+    """Added to the estimated position, map axes, m."""
     position_radius: NonNegative = 0.0
     """A further offset is drawn uniformly from a ball of this radius, m."""
     orientation_offset_wxyz: QuaternionWxyz = (1.0, 0.0, 0.0, 0.0)
@@ -192,9 +192,9 @@ class InitialEstimate(Section):
     orientation_angle: NonNegative | Literal["uniform"] = 0.0
     """A further turn about a random axis by an angle drawn from [0, this] rad; `uniform`: over SO(3)."""
     yaw: Number | None = None
-    """Absolute believed yaw, rad; replaces R(0) above."""
+    """Absolute estimated yaw, rad; replaces R(0) above."""
     quaternion_wxyz: QuaternionWxyz | None = None
-    """Absolute believed orientation; replaces R(0) above."""
+    """Absolute estimated orientation; replaces R(0) above."""
 
     @field_validator("position", mode="before")
     @classmethod

@@ -46,9 +46,9 @@ class Observation(Section):
     map_scale: Positive = 10.0
     """m, of landmarks of the map"""
     map_size: int = Field(default=8, ge=1, le=256)
-    """Landmarks of the map that fields per landmark tell of: those nearest by the vehicle's own estimate."""
+    """Landmarks of the map of the fields per landmark: those nearest by the vehicle's own estimate."""
     route_step: Positive = 0.5
-    """m; `route_ahead` tells of the way so far ahead, and twice, four and eight times as far"""
+    """m; `route_ahead` shows the way so far ahead, and twice, four and eight times as far"""
     scales: dict[str, Positive] = Field(default={})
     """Scales of single fields by name, in place of their own."""
     centers: dict[str, Number] = Field(default={})

@@ -61,7 +61,7 @@ FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
     "clearance": [
         ("message_clearance", "neighbour", 2, "m", 2, -1,
          "least distance within 6 s to the neighbour, if that drives straight on at top speed and this vehicle follows "
-         "its route at top speed, or stands; 4: farther, or nothing heard", None, 2.0),
+         "its route at top speed, or stands; 4: farther, or nothing received", None, 2.0),
     ],
     "precedence": [
         ("message_precedence", "neighbour", 1, "bool", 1, 0,

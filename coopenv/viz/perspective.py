@@ -196,7 +196,7 @@ class View3d:
             import pyvista
         self._pv: Any = pyvista
         self._camera, self._picked = camera, vehicle
-        with pyvista.vtk_verbosity("off"):  # it would tell that there is no display
+        with pyvista.vtk_verbosity("off"):  # it would report that there is no display
             self._build(scenario, size)
             self._plot.render()
 

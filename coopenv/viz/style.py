@@ -78,9 +78,9 @@ def save(figure: Figure, path: Path, file_format: str = "", about: Mapping[str, 
     check_one_of(f"{path}: unknown format of a figure", form, FORMATS)
     stamp = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}[form]  # the same figure is the same file
     words = "; ".join(f"{name}: {value}" for name, value in (about or {}).items())
-    told = {"Title": path.stem, {"png": "Description", "pdf": "Subject", "svg": "Description"}[form]: words}
+    metadata = {"Title": path.stem, {"png": "Description", "pdf": "Subject", "svg": "Description"}[form]: words}
     with replacing_file(path) as new, rc_context({"svg.hashsalt": "coopenv", "pdf.fonttype": 42}):
-        figure.savefig(new, dpi=DPI, format=form, metadata={stamp: None, **(told if words else {})})
+        figure.savefig(new, dpi=DPI, format=form, metadata={stamp: None, **(metadata if words else {})})
     return path
 
 

@@ -161,7 +161,7 @@ def trajectory_figure_3d(
 ) -> Figure:
     """Draw the paths in space, one scale on all axes, in metres; arguments, frame and ends as in plan.
 
-    Stems tell over which point of the floor a start, an end or a landmark is.
+    Stems show over which point of the floor a start, an end or a landmark is.
     """
     low, high = _scene(trajectory)
     steep = float((high - low)[2] / np.max((high - low)[:2]))

@@ -17,7 +17,7 @@ from coopenv.world.dynamics import depart, move, move_landmarks, referee
 from coopenv.world.model import Precision
 from coopenv.world.nearby import sort_into_cells
 from coopenv.world.odometry import measure_odometry
-from coopenv.world.reset import begin_sensing, place_everybody
+from coopenv.world.reset import begin_sensing, place_bodies
 from coopenv.world.route import appear, direct_traffic
 from coopenv.world.v2x import transmit
 from coopenv.world.warp_internals import device_function
@@ -174,7 +174,7 @@ HOST = Embedded("host", estimate_nothing, start_nothing, send_nothing)
 @device_function
 def begin_simulation(model: Any, state: Any, record: Any, world: int):
     """Draw the start of an episode, and take the first frame."""
-    place_everybody(model, state, world)
+    place_bodies(model, state, world)
     begin_sensing(model, state, world)
 
 

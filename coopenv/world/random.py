@@ -180,7 +180,7 @@ NOT_SET = -1.0
 
 @wp.func
 def draw_parameters(model: Any, state: Any, world: int):
-    """Draw the factors of a world, but for those that somebody has set."""
+    """Draw the factors of a world, but for those that are set."""
     level = state.difficulty[world]
     one = type(level)(1.0)
     for k in range(model.drawn.low.shape[0]):

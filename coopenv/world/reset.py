@@ -273,7 +273,7 @@ def set_initial_estimate(model: Any, state: Any, world: int, vehicle: int):
 
 
 @wp.func
-def place_everybody(model: Any, state: Any, world: int):
+def place_bodies(model: Any, state: Any, world: int):
     """Begin at tick 0: draw the world's random quantities and place all bodies."""
     state.tick[world] = 0
     state.exhausted[world] = 0

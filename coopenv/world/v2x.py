@@ -194,7 +194,7 @@ def as_broadcast(model: Any, state: Any, world: int, vehicle: int, R: Any, posit
 def odometry_as_broadcast(model: Any, state: Any, world: int, vehicle: int, R: Any, R_odometry: Any, p_odometry: Any):
     """Return the dead reckoning that a vehicle broadcasts for (R_odometry, p_odometry), at the attitude R.
 
-    That of a consistent liar leads where its poses do.
+    With a consistent `lie` it leads to the broadcast poses.
     """
     sent_R = R_odometry
     sent_p = p_odometry

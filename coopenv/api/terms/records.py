@@ -121,7 +121,7 @@ class Neighbour:
     bearing: wp.vec3  # unit vector camera to the vehicle, body, last measured; 0: never
     in_view: wp.bool  # measured in this frame
     bearing_age: wp.float32  # s since measured
-    precedes: wp.bool  # it was heard and has the right of way
+    precedes: wp.bool  # a message of it is at hand, and it has the right of way
     sees: wp.bool  # by its message at hand, it measured this vehicle in the frame of the sending
     seen_age: wp.float32  # s since it measured this vehicle, by its last message
 

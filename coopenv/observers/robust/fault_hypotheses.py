@@ -209,7 +209,7 @@ def set_fault_mixture(memory: Any, world: int, i: int, most: Any, total: Any):
 def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: int):
     """Weigh the hypotheses after a block of a time, s; exclude the source of one nearly certain, own sensors first.
 
-    Soon after it began, a fault of the gyro cannot be told from one of the camera: if both are likelier than none, both
+    Soon after it began, a fault of the gyro looks like one of the camera: if both are likelier than none, both
     count as faulty. Innovations of a wrong pose, while the gate is disabled, show no faults but those of own sensors.
     """
     end_block(memory, world, i, time)

@@ -270,7 +270,7 @@ def restart_fault(memory: Any, world: int, i: int, q: int):
 def end_block(memory: Any, world: int, i: int, time: Any):
     """Add the information of a block of a time, s, on each source's fault to its sums; begin the next block.
 
-    While the gate locates a fault, the block tells of the sources that it rejects, of the camera and the gyro.
+    While the gate locates a fault, the block counts for the sources that it rejects, the camera and the gyro.
     """
     located = gate_locates_fault(memory, world, i)
     count = eliminate_senders(memory, world, i, wp.float64(constants.MONITOR_TIME) / time)

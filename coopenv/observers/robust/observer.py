@@ -171,7 +171,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
     share, fitting, nis = gate(frame, memory, world, i)
     state.nis[world, i] = nis
     state.nis_dof[world, i] = 2 * fitting
-    if share >= wp.float64(0.0):  # rejected bearings tell of faults
+    if share >= wp.float64(0.0):  # rejected bearings show faults
         iterated_update(frame, memory, world, i)
         correct_sources(frame, memory, world, i)
     memory.belief[world, i].block_time += frame.period
