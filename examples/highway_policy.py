@@ -5,7 +5,7 @@ Run: python examples/highway_policy.py           (five minutes on one core; the 
 
 Needs the extras `highway` and `train`. A DQN of Stable-Baselines3 learns on plain `intersection-v0`, where it sees true
 kinematics. Then the same episodes are driven four times: on the truth, and wrapped in `EstimatedKinematics` with ideal,
-sensed and blind cameras, where policy and lane keeping both act on what the car's observer believes.
+sensed and blind cameras, where policy and lane keeping both act on what the car's observer estimates.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Improve a speed profile by gradient descent, so that the vehicles know better where they are when they arrive.
 
-The distance that each vehicle is told to drive stays the same: only when it drives slowly and when fast changes.
+The distance that each vehicle is commanded to drive stays the same: only when it drives slowly and when fast changes.
 Run: python examples/improve_speed_profile.py (about two minutes)
 """
 

@@ -1,4 +1,4 @@
-"""Step an environment by hand and watch one vehicle find out where it is.
+"""Step an environment in a loop and watch one vehicle find out where it is.
 
 Run: python examples/observe.py (about 10 s)
 """

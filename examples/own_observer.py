@@ -32,7 +32,7 @@ class Ekf:
         F[3:, :3] = -cross_matrix(step)
         self.R, self.p = self.R @ tick.rotation, self.p + step
         self.P = F @ self.P @ F.T + np.diag(self.noise.odometry(tick.dt))
-        for _, bearing, position, message in tick.usable():  # landmarks, and neighbours that have been heard
+        for _, bearing, position, message in tick.usable():  # landmarks, and neighbours whose message is at hand
             known = message is None or message.covariance is None
             self.correct(tick, bearing, position, np.zeros((3, 3)) if known else message.covariance)
         return Estimate(self.R, self.p)

@@ -7,7 +7,7 @@ ROAD = 3.0  # half width of the road, m
 
 
 def lane_offset(ego):
-    """Where the car believes to be across the lane, m."""
+    """Estimated position across the lane, m."""
     return ego.position_estimate[0] - LANE
 
 
