@@ -39,7 +39,15 @@ REPLACED = {
     r"MovedWorld|peeled|taped|by hand": "CosimulatedWorld, ablated_stages, recorded, the command",
     r"made to measure|(nothing|all) (was|were) tuned on": "parametric, held-out",
 }
-"""Words of which a page has none, as regular expressions, and words that take their place."""
+"""Words of which a page and a program have none, as regular expressions, and words that take their place."""
+KEPT = ("liar_among_us", "Liar among us", "lane_liar", "ring_liar", '["heard"]', '"heard":')
+"""Names that stay: of an environment and scenes of the leaderboard, and of a saved field."""
+PROGRAMS = [
+    file
+    for folder, kinds in {"coopenv": "py", "examples": "py toml", "envs": "toml", "agents": "py toml md"}.items()
+    for kind in kinds.split()
+    for file in sorted((ROOT / folder).rglob(f"*.{kind}"))
+]
 
 FENCE = re.compile(r"^( *)(```+|~~~+)[^\n]*\n.*?^ *\2[ \t]*$", re.DOTALL | re.MULTILINE)
 COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
@@ -79,10 +87,29 @@ def test_no_sentence_is_long(name: str) -> None:
 
 @pytest.mark.parametrize("name", PAGES)
 def test_words_are_those_of_the_field(name: str) -> None:
-    for pattern, instead in REPLACED.items():
-        word = re.compile(rf"\b(?:{pattern})\b", re.IGNORECASE)
-        found = [line for line in PAGES[name].splitlines() if word.search(line)]
-        assert not found, f"{name}: use {instead}"
+    assert not replaced_words(PAGES[name])
+
+
+def test_names_comments_and_strings_have_words_of_the_field() -> None:
+    found = {file.relative_to(ROOT).as_posix(): replaced_words(file.read_text(encoding="utf-8")) for file in PROGRAMS}
+    assert len(found) > 200 and not {name: words for name, words in found.items() if words}
+
+
+@pytest.mark.parametrize("line", ["heard = Queue()", "ToldState", "def tell_all(): ...", "# nobody hears", "LaneLiar"])
+def test_words_are_found_in_names(line: str) -> None:
+    assert replaced_words(f"first\n{line}")
+
+
+def replaced_words(text: str) -> list[str]:
+    """Return the words of a text that are not of the field, also within names, and those that take their place."""
+    for name in KEPT:
+        text = text.replace(name, "")
+    text = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", text)
+    return [
+        f"{word}: use {instead}"
+        for pattern, instead in REPLACED.items()
+        for word in re.findall(rf"(?<![a-z])(?:{pattern})(?![a-z])", text, re.IGNORECASE)
+    ]
 
 
 def test_sentences_are_short_in_the_mean() -> None:
