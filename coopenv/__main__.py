@@ -1,5 +1,6 @@
 """The command `coopenv`, also `python -m coopenv`: signals are caught before anything else is loaded."""
 
+import codecs
 import gc
 import io
 import os
@@ -14,10 +15,13 @@ def main() -> int:
     gc.set_threshold(100_000)  # imports and scenarios make many objects that stay
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small, and threads take a fifth of `coopenv list`
     interrupts.install()
+    from coopenv.base.errors import escaped
+
+    codecs.register_error("escaped", escaped)
     sys.stderr = sys.stderr or Path(os.devnull).open("w")  # noqa: SIM115 (libraries write to a closed one too)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # file names need not be text
+            stream.reconfigure(errors="escaped")  # file names need not be text
     try:
         from coopenv.cli import main
 

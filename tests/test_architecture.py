@@ -85,10 +85,10 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 
 LINES_AND_FILES = {
-    ".": (124, 2),
+    ".": (128, 2),
     "api": (4400, 19),
     "backends": (3825, 17),
-    "base": (1880, 10),
+    "base": (1894, 10),
     "bench": (5423, 18),
     "cars": (10955, 39),
     "cli": (2678, 8),

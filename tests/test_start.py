@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import os
 import subprocess
@@ -14,6 +15,7 @@ import pytest
 import coopenv
 import coopenv.observers
 import coopenv.runs
+from coopenv.base.errors import escaped, printable
 from coopenv.cli import options
 from tests.helpers.four_way import FOUR_WAY
 
@@ -207,3 +209,13 @@ def test_completion_is_offered_by_the_program() -> None:
     command = [sys.executable, "-c", "from coopenv.cli import app; app(prog_name='coopenv')"]
     result = subprocess.run(command, env={**os.environ, **asked}, capture_output=True, text=True, check=False)
     assert result.stdout.split() == ["crossing_path", "crossroad:"]
+
+
+def test_a_name_that_the_locale_cannot_decode_is_printed_as_its_characters() -> None:
+    locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    command = [sys.executable, "-m", "coopenv", "run", "é/x.toml".encode()]
+    result = subprocess.run(command, env={**os.environ, **locale}, capture_output=True, check=False)
+    assert result.stderr == b"error: no such scenario file: \\xe9/x.toml\n"
+    assert printable("\udcc3\udca9 \udcff \ud800 \x1b") == r"é \udcff \ud800 \x1b"
+    codecs.register_error("escaped", escaped)
+    assert "\udcc3\udca9 σ \udcff".encode("ascii", "escaped") == rb"\xe9 \u03c3 \udcff"

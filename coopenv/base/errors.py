@@ -7,6 +7,7 @@ in training.
 """
 
 import os
+import re
 import secrets
 from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
@@ -114,8 +115,21 @@ def check_memory(size: float, what: str, available: int | None = None) -> None:
         raise CoopenvError(f"{what} would need {size / 2**30:.3g} GiB of memory, there are {available / 2**30:.3g}")
 
 
+def escaped(problem: UnicodeError) -> tuple[str, int]:
+    """Return characters that a stream cannot encode as escapes (`codecs.register_error`); bytes are decoded first."""
+    assert isinstance(problem, UnicodeEncodeError)
+    return ascii(_decoded(problem.object[problem.start : problem.end]))[1:-1], problem.end
+
+
+def _decoded(text: str) -> str:
+    """Return a text in which bytes of file names that are UTF-8 are characters, whatever the locale."""
+    with_bytes = ("utf-8", "surrogateescape")
+    return re.sub("[\udc80-\udcff]+", lambda found: found[0].encode(*with_bytes).decode(*with_bytes), text)
+
+
 def printable(text: str) -> str:
     """Return a text whose control characters, which a terminal would obey, are escaped."""
+    text = text if text.isprintable() else _decoded(text)
     return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
