@@ -106,6 +106,8 @@ def scenario_path(name_or_path: str | Path) -> Path:
         found = f"{short}: a folder; {EXPECTED}; coopenv view opens that of a run"
     elif there and path.suffix == ".zip":
         found = f"{short}: a run as one file, which alone `coopenv run` plays again"
+    elif not there and os.path.exists(path):  # noqa: PTH110 (never raises)
+        found = f"{short}: neither a file nor a folder; {EXPECTED}"
     elif not there:
         near = suggest(path.stem, names) or ("" if path.suffix == ".toml" else f"; {EXPECTED}")
         found = f"no such scenario file: {short}{near}"

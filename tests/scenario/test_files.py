@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,9 @@ def test_unknown_names_and_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         (tmp_path / "notes.txt").touch()
         monkeypatch.chdir(tmp_path)
         load_scenario("notes.txt")
+    os.mkfifo("pipe.toml")
+    with pytest.raises(UnknownEnvironmentError, match=r"pipe\.toml: neither a file nor a folder; expected a scenario"):
+        load_scenario("pipe.toml")
 
 
 @pytest.mark.parametrize("name", ["~nosuchuser/x.toml", "a" * 5000 + ".toml", "x\0.toml", "/" + "a/" * 5000])
