@@ -96,7 +96,7 @@ LINES_AND_FILES = {
     "evaluation": (495, 3),
     "observers": (11725, 42),
     "policies": (2078, 10),
-    "runs": (3524, 13),
+    "runs": (3534, 13),
     "scenario": (3737, 12),
     "training": (1612, 6),
     "viz": (4830, 16),

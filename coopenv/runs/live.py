@@ -21,6 +21,7 @@ from coopenv.scenario import Scenario
 from coopenv.viz.scene import Frame, Origin, SceneRecord
 from coopenv.viz.stage import vehicle_mark
 from coopenv.viz.topview import PictureWindow, TopView
+from coopenv.viz.topview_ground import HEIGHT, WIDTH
 from coopenv.viz.web.panel import Abilities
 
 LEAVE, AGAIN = {"escape", "q"}, {"r"}
@@ -101,18 +102,10 @@ class LiveWorld:
                 yield self._view.draw(self.engine)
         yield self._view.draw(self.engine)
 
-    def window(self, seed: int, window: PictureWindow | None, instead: str = "") -> PictureWindow:
-        """Return a window that shows the start of an episode; `instead` names what works without a display.
-
-        Raises:
-            CoopenvError: there is no display.
-        """
+    def start(self, seed: int, window: PictureWindow) -> None:
+        """Show the start of an episode."""
         self.engine.reset([seed])
-        window = window or PictureWindow(self.scenario.title)
         window.show(self._view.draw(self.engine))
-        if not window.is_open:
-            raise CoopenvError(f"there is no display to open a window on{instead}")
-        return window
 
     def run(self, policy: Policy, seed: int, window: PictureWindow, speed: float, going: Callable[[], bool]) -> None:
         """Show an episode at a multiple of real time while `going` returns True."""
@@ -133,6 +126,20 @@ class LiveWorld:
         ]
 
 
+def opened(scenario: Scenario, window: PictureWindow | None, instead: str = "") -> PictureWindow:
+    """Return an open window, as it is needed before kernels are compiled; `instead` names a way without a display.
+
+    Raises:
+        CoopenvError: there is no display.
+    """
+    if window is None:
+        window = PictureWindow(scenario.title)
+        window.show(np.full((HEIGHT, WIDTH, 3), 255, np.uint8))
+    if not window.is_open:
+        raise CoopenvError(f"there is no display to open a window on{instead}")
+    return window
+
+
 def watch(
     scenario: Scenario, policy: Policy, seed: int, log: Console, window: PictureWindow | None = None, speed: float = 1.0
 ) -> LiveWorld:
@@ -141,8 +148,9 @@ def watch(
     Raises:
         CoopenvError: there is no display.
     """
+    shown = opened(scenario, window, "; --out DIR writes a film instead")
     stage = LiveWorld(scenario, log)
-    shown = stage.window(seed, window, "; --out DIR writes a film instead")
+    stage.start(seed, shown)
     stage.run(policy, seed, shown, speed, lambda: shown.is_open)
     return stage
 
@@ -161,8 +169,9 @@ def drive_by_hand(
     Raises:
         CoopenvError: there is no display.
     """
+    shown = opened(scenario, window)
     stage = LiveWorld(scenario, log)
-    shown = stage.window(seed, window)
+    stage.start(seed, shown)
     log.print(HELP)
     keys = Keys(shown.canvas)
     policy = Keyboard(scenario, vehicle, others, keys)

@@ -147,6 +147,12 @@ def test_without_a_display_one_line_says_so(capsys: pytest.CaptureFixture[str]) 
     assert capsys.readouterr().err.splitlines()[-1] == error
 
 
+@pytest.mark.parametrize("command", ["play urban_crossing", "watch route_follower"])
+def test_a_window_is_opened_before_kernels_are_compiled(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(Engine, "load")
+    assert "there is no display" in refused(*command.split())
+
+
 def test_a_film_in_place_of_the_window(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
