@@ -174,7 +174,8 @@ class Bundle:
                 wrong = [name for name, size in sizes.items() if size > most[name]]
                 missing = [name for name in PARTS if name not in sizes]
                 if wrong or missing:
-                    raise DataError(f"{path}: not a run: parts {listed(missing or wrong)}")
+                    found = f"{listed(missing or wrong)} {'missing' if missing else 'unknown or too large'}"
+                    raise DataError(f"{path}: not a run: parts {found}")
                 parts = {name: archive.open(name).read(size) for name, size in sizes.items()}
             manifest = validated(Manifest, parts[MANIFEST], f"{path}: {MANIFEST}", DataError)
             digests = {**manifest.parts, MANIFEST: archive.comment.decode()}
