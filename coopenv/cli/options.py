@@ -495,7 +495,7 @@ def parse_overrides(assignments: Sequence[str] | None) -> dict[str, Any]:
         key, equals, text = assignment.partition("=")
         key, text = key.strip(), text.strip()
         if not equals or not key:
-            raise CoopenvError(f"--override {assignment}: expected KEY=VALUE, e.g. --override noise.enabled=false")
+            raise CoopenvError(f"--set or --override {assignment}: expected KEY=VALUE, e.g. noise.enabled=false")
         overrides[key] = parse_value(text)
     return overrides
 

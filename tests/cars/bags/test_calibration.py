@@ -259,7 +259,7 @@ BAD: list[tuple[list[str], str]] = [
     (["empty.bag", "--map", "calibrated.toml"], "nowhere.toml"),
     (["empty.bag", "--map", "number.toml"], "calibration"),
     (["short.mcap"], "short.mcap: vehicle_1 has"),
-    (["empty.bag", "--map", "good.toml", "--set", "camera"], "--override camera: expected KEY=VALUE"),
+    (["empty.bag", "--map", "good.toml", "--set", "camera"], "--set or --override camera: expected KEY=VALUE"),
 ]
 
 
