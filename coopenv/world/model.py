@@ -11,6 +11,7 @@ import warp as wp
 
 from coopenv.base.errors import DeviceError, suggest
 from coopenv.world.launch import start_warp
+from coopenv.world.warp_internals import field_types
 
 
 @dataclass(frozen=True)
@@ -387,4 +388,4 @@ def model_struct(p: Precision) -> Any:
 
 def entry_struct(p: Precision, name: str) -> Any:
     """Return the struct of the entries of one of the model's arrays of structs."""
-    return model_struct(p).vars[name].type.dtype
+    return field_types(model_struct(p))[name].dtype

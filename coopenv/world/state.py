@@ -48,7 +48,7 @@ def array(axes: str, dtype: Any, rule: Rule | None = None) -> Any:
 
 def fields(record: Any) -> dict[str, Any]:
     """Return the arrays that a record's struct declares with `array`, by name: annotations with `axes` and `dtype`."""
-    return {name: var.type for name, var in record.vars.items() if hasattr(var.type, "axes")}
+    return {name: kind for name, kind in field_types(record).items() if hasattr(kind, "axes")}
 
 
 SCRATCH = "L"

@@ -4,7 +4,7 @@
 |---|---|---|
 | `replay_of` | `context._build_cpu_args_structs`, `command.hooks.forward` | launch in a microsecond |
 | `device_function`, `subroutine` | `Function.__class__`, `inline_hint`, `overload.adj` | records by reference |
-| `struct_of`, `field_types` | `StructInstance._cls`, `Struct.vars` | fields of a record by its instance |
+| `struct_of`, `field_types` | `StructInstance._cls`, `Struct.vars` | fields of a record |
 | `scalar_of` | `_wp_scalar_type_` | the NumPy type of an array of vectors |
 | `kernel_hashes` | `context.user_modules`, `Module.get_module_hash` | what a report of a run was computed with |
 | `_kernel_source` | `codegen.codegen_kernel`, `Adjoint.args` | no copies of records; no kernels of the host on CUDA |
@@ -167,8 +167,8 @@ def struct_of(record: Any) -> Any:
 
 
 def field_types(record: Any) -> dict[str, Any]:
-    """Return the types of the fields of an instance of a `wp.struct`, by name."""
-    return {name: field.type for name, field in struct_of(record).vars.items()}
+    """Return the types of the fields of a `wp.struct` or an instance of one, by name."""
+    return {name: field.type for name, field in getattr(record, "_cls", record).vars.items()}
 
 
 def scalar_of(kind: Any) -> Any:

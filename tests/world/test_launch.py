@@ -194,6 +194,7 @@ def test_flags_of_the_user_stay(monkeypatch: pytest.MonkeyPatch, flags: str | No
 
 
 PRIVATE = {"_cls", "_wp_scalar_type_", "native_func", "hooks", "adj", "runtime"}
+PRIVATE |= {"vars", "get_module_hash", "user_modules", "inline_hint"}
 PACKAGE = Path(coopenv.__file__).parent
 NAMED = re.compile(rf"\b({'|'.join(PRIVATE)}|_src|__class__|warp\._)")
 OWN = PACKAGE / "world" / "warp_internals.py"
