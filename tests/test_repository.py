@@ -97,6 +97,11 @@ def test_the_pythons_that_are_promised_are_tested() -> None:
     assert versions == promised and project()["requires-python"] == f">={versions[0]}"
 
 
+def test_the_lowest_versions_the_newest_warp_and_limits_of_kernels_are_tested() -> None:
+    targets = read(GITHUB / "workflows" / "tests.yml")["jobs"]["more"]["strategy"]["matrix"]["target"]
+    assert targets == ["test-matrix CELLS=lowest", "test-matrix CELLS=warp", "cuda-check CUDA_OPTIONS='--arch 90'"]
+
+
 def test_containers_are_of_files_that_exist() -> None:
     container = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text(encoding="utf-8"))
     assert (ROOT / ".devcontainer" / container["build"]["dockerfile"]).is_file()
