@@ -12,12 +12,14 @@ import tomllib
 import venv
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from ruamel.yaml import YAML
 
 from sitegen import mirror, release_notes
+from tests import conftest
 
 ROOT = Path(__file__).resolve().parents[1]
 GITHUB = ROOT / ".github"
@@ -239,3 +241,12 @@ def test_tools_of_a_release_are_those_of_the_tests_and_have_hashes() -> None:
         name, _, version = tool.partition("==")
         assert pinned.get(name.replace("-", "_"), pinned.get(name, version)) == version, name
         assert hashes and all(re.fullmatch(r"--hash=sha256:[0-9a-f]{64}", text) for text in hashes), name
+
+
+def test_without_sumo_only_tests_of_its_environment_are_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(conftest, "find_spec", lambda name: None)
+    names = ("f[sumo_crossing]", "f[1-sumo_crossing-a]", "f[docs/sumo.md]", "test_the_page_on_sumo", "f[a]")
+    skipped: list[str] = []
+    items: Any = [SimpleNamespace(name=name, add_marker=lambda _, name=name: skipped.append(name)) for name in names]
+    conftest.pytest_collection_modifyitems(items)
+    assert skipped == [*names[:2]]
