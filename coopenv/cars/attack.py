@@ -253,7 +253,7 @@ class Intruder:
 
 
 @dataclass
-class Outcome:
+class AttackOutcome:
     """What the messages of a kind did."""
 
     what: str
@@ -271,7 +271,7 @@ class Outcome:
         return self.through > 0 or self.speed > MOVES
 
 
-def attack(intruder: Intruder, commands: int) -> Iterator[Outcome]:
+def attack(intruder: Intruder, commands: int) -> Iterator[AttackOutcome]:
     """Attack standing cars with messages of each kind, and yield what each did; a kind that succeeds is ended.
 
     Args:
@@ -310,8 +310,8 @@ def _driven(intruder: Intruder, car: str) -> str:
     return f"{car}: moves" if intruder.speeds[car] > MOVES else ""
 
 
-def _try(intruder: Intruder, what: str, send: Send, each: int) -> Outcome:
-    found, before = Outcome(what), intruder.gates.states
+def _try(intruder: Intruder, what: str, send: Send, each: int) -> AttackOutcome:
+    found, before = AttackOutcome(what), intruder.gates.states
     intruder.answered = 0
     for i in range(each):
         for car in intruder.cars:
@@ -328,7 +328,7 @@ def _try(intruder: Intruder, what: str, send: Send, each: int) -> Outcome:
     return found
 
 
-def _look(intruder: Intruder, found: Outcome, before: Mapping[str, Any]) -> Outcome:
+def _look(intruder: Intruder, found: AttackOutcome, before: Mapping[str, Any]) -> AttackOutcome:
     found.refused, found.through = 0, intruder.answered
     for car, gate in intruder.gates.states.items():
         new = gate.rejections - before[car].rejections

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from coopenv.cars.bags.log import TopicRow
-    from coopenv.cars.calibration import Calibrated, Row
+    from coopenv.cars.calibration import Calibrated, ConstantRow
 
 
 def import_(
@@ -208,7 +208,7 @@ def identify(
     console.print(f"File: {out}", soft_wrap=True)
 
 
-def _print(rows: Sequence[Row]) -> None:
+def _print(rows: Sequence[ConstantRow]) -> None:
     """Print a table of constants."""
     from coopenv.runs.console import number_table
 

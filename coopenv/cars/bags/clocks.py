@@ -149,7 +149,7 @@ def written(seconds: float, error: float) -> str:
 Leads = Mapping[str, Lead]  # by topic
 
 
-class Signal:
+class SampledSignal:
     """A cumulated signal of time: heading, distance or pose; there is none within holes."""
 
     def __init__(self, times: Array, values: Array) -> None:
@@ -159,7 +159,7 @@ class Signal:
         self._from, self._to = times[ends], times[ends + 1]
 
     @classmethod
-    def of_rates(cls, times: Array, rates: Array) -> "Signal":
+    def of_rates(cls, times: Array, rates: Array) -> "SampledSignal":
         """Return the integral of rates (n,)."""
         return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) * (rates[1:] + rates[:-1]) / 2)]))
 
@@ -238,7 +238,7 @@ def lead_by(residual: Residual, times: Array, most: float, least: float, *, scal
     return Lead(offset, float(np.hypot(np.sqrt((sums**2).sum()) / information, least)))
 
 
-def lead_of_motion(signal: Signal, reference: Signal, least: float = FLOOR) -> Lead | None:
+def lead_of_motion(signal: SampledSignal, reference: SampledSignal, least: float = FLOOR) -> Lead | None:
     """Return by how much the stamps of turns or distances are early, by another source of the same."""
     span = reference.times[-1] - reference.times[0]
     begin = np.arange(reference.times[0], reference.times[-1] - INTERVAL, max(STEP, span / MOST))
@@ -251,7 +251,7 @@ def lead_of_motion(signal: Signal, reference: Signal, least: float = FLOOR) -> L
     return lead_by(residual, begin, np.inf, least, scaled=True)
 
 
-def lead_of_bearings(times: Array, azimuths: Array, targets: Array, camera: Array, path: Signal) -> Lead | None:
+def lead_of_bearings(times: Array, azimuths: Array, targets: Array, camera: Array, path: SampledSignal) -> Lead | None:
     """Return by how much the stamps of bearings are early, by the known path (x, y, heading) of the car.
 
     They are (n,) times, s, azimuths in the body frame and (n, 2) targets in the map; the camera is at (2,) in the body.
@@ -271,7 +271,7 @@ def lead_of_bearings(times: Array, azimuths: Array, targets: Array, camera: Arra
     return lead_by(residual, times, ABSURD, FLOOR)
 
 
-def turn_of(times: Array, azimuths: Array, places: Array) -> Signal | None:
+def turn_of(times: Array, azimuths: Array, places: Array) -> SampledSignal | None:
     """Return the heading (n,) by the bearings of standing landmarks, as `lead_of_bearings` has them.
 
     Between two frames it changes by the median change of their azimuths; translation adds a little to that.
@@ -285,7 +285,7 @@ def turn_of(times: Array, azimuths: Array, places: Array) -> Signal | None:
     turned = np.zeros(len(steps))
     turned[common] = -np.nanmedian(steps[common], axis=1)
     kept = np.concatenate([[True], common])
-    return Signal(frames[kept], np.concatenate([[0.0], np.cumsum(turned)])[kept]) if common.any() else None
+    return SampledSignal(frames[kept], np.concatenate([[0.0], np.cumsum(turned)])[kept]) if common.any() else None
 
 
 CAMERAS = (Role.DETECTIONS, Role.BEARINGS)
@@ -324,21 +324,21 @@ def leads_of(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Bindi
 ODOMETRY = (Role.WHEEL, Role.IMU, Role.ODOMETRY)
 
 
-def _cumulated(tracks: Mapping[str, Any]) -> tuple[Signal | None, Signal | None]:
+def _cumulated(tracks: Mapping[str, Any]) -> tuple[SampledSignal | None, SampledSignal | None]:
     """Return cumulated distances and turns of a topic; None: it does not measure them."""
     rates = ((tracks["wheel_time"], tracks["wheel"].real), (tracks["gyro_time"], tracks["gyro"]))
-    distance, turn = (Signal.of_rates(t, v) if len(t) > 1 and np.ptp(v) > 0.0 else None for t, v in rates)
+    distance, turn = (SampledSignal.of_rates(t, v) if len(t) > 1 and np.ptp(v) > 0.0 else None for t, v in rates)
     return distance, turn
 
 
-def _path(tracks: Mapping[str, Any]) -> tuple[Signal, Signal, Signal] | None:
+def _path(tracks: Mapping[str, Any]) -> tuple[SampledSignal, SampledSignal, SampledSignal] | None:
     """Return distance, heading and path (x, y, heading) by motion capture; None: there is none."""
     t, place, heading = tracks["truth_time"], tracks["truth"], np.unwrap(tracks["truth_yaw"])
     if len(t) < FEWEST:
         return None
     forward = (np.diff(place) * np.exp(-0.5j * (heading[1:] + heading[:-1]))).real
-    path = Signal(t, np.column_stack([place.real, place.imag, heading]))
-    return Signal(t, np.concatenate([[0.0], np.cumsum(forward)])), Signal(t, heading), path
+    path = SampledSignal(t, np.column_stack([place.real, place.imag, heading]))
+    return SampledSignal(t, np.concatenate([[0.0], np.cumsum(forward)])), SampledSignal(t, heading), path
 
 
 def _azimuths(samples: Sequence[Sample], start: int, binding: Binding, vehicle: int) -> tuple[Array, Array, Array]:

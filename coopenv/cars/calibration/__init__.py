@@ -31,7 +31,7 @@ from coopenv.cars.calibration.batch import (
     standard_errors,
     stated_rate,
 )
-from coopenv.cars.calibration.drives import CarDrive, Drive
+from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive
 from coopenv.estimation.lens import PLUMB_BOB
 from coopenv.estimation.poses import Array, Mask
 
@@ -41,8 +41,6 @@ LEAST_GAIN = 15.0  # of the cost, beyond the penalty
 SIGNIFICANT = 3.0  # standard errors
 FINEST = {"deg": 0.0035, "m": 0.004, "px": 1.0, "": 0.01, "rad/s": 0.002, "s": 0.008}
 """By unit (rad for deg), the least deviation that counts as wrong."""
-
-
 LARGEST_PIXEL, LARGEST_ANGLE, LARGEST_PLACE = 4.0, 0.02, 0.1
 """Standard deviations of residuals (pixels; rad without pixels; m of motion capture) above which nothing fits."""
 UNITS = {"deg/s": 57.3, "km/h": 3.6, "mm/s": 1000.0}
@@ -53,7 +51,7 @@ TIGHT = {"marker": 0.01, "truth.frame": 0.01}
 
 
 @dataclass(frozen=True)
-class Row:
+class ConstantRow:
     """A constant."""
 
     name: str
@@ -71,7 +69,7 @@ class Calibrated:
     batch: Batch
     given: Fit  # with all constants as given
     fit: Fit  # with the wrong ones corrected
-    rows: tuple[Row, ...]
+    rows: tuple[ConstantRow, ...]
     findings: tuple[str, ...]  # a line per finding
     notes: tuple[str, ...]  # which stamps import has moved
     noise: dict[str, float]  # measured, by key of an environment; none where residuals are not explained
@@ -118,7 +116,7 @@ def exchanged(batch: Batch) -> list[tuple[int, int]]:
     return found
 
 
-def calibrate(drive: Drive, truth: bool = True) -> Calibrated:
+def calibrate(drive: CalibrationDrive, truth: bool = True) -> Calibrated:
     """Return constants and findings of a drive; `truth`: whether motion capture counts.
 
     Raises:
@@ -211,7 +209,7 @@ def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]
         judged = ((bad, "wrong"), (loose, "not determined by this drive"), (within, WITHIN))
         finding = next((words for found, words in judged if found[n]), "")
         old, value, std = (factor * float(v) for v in (batch.base[n], batch.base[n] + x[n], error[n]))
-        rows[int(n)] = Row(kind.name, kind.unit, old, value, std, finding)
+        rows[int(n)] = ConstantRow(kind.name, kind.unit, old, value, std, finding)
     names = batch.drive.landmarks
     lines = [*unexplained, *(f"markers {names[i]} and {names[j]} are exchanged" for i, j in pairs)]
     for title, part in parts_of(batch).items():
@@ -313,7 +311,7 @@ def toml_text(result: Calibrated) -> str:
     return tables_text(first, {"overrides": overrides(result), "clocks.leads": leads, **tables}, result.rows)
 
 
-def tables_text(first: str, tables: Mapping[str, Mapping[str, object]], rows: Sequence[Row]) -> str:
+def tables_text(first: str, tables: Mapping[str, Mapping[str, object]], rows: Sequence[ConstantRow]) -> str:
     """Return tables, and one of constants, as TOML after a comment."""
     lines = [f"# {first}"]
     for name, table in tables.items():

@@ -29,7 +29,7 @@ from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import DataError
-from coopenv.cars.calibration.drives import CarDrive, Drive, averaged
+from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive, averaged
 from coopenv.estimation.lens import COEFFICIENTS, distort, largest_radius
 from coopenv.estimation.poses import Array, Mask, skew
 from coopenv.scenario import Scenario
@@ -117,7 +117,7 @@ class Fit:
 class Batch:
     """The least squares of a drive."""
 
-    def __init__(self, drive: Drive, truth: bool) -> None:
+    def __init__(self, drive: CalibrationDrive, truth: bool) -> None:
         """Prepare it; `truth`: whether motion capture counts. Raises DataError: odometry or geometry is lacking."""
         self.drive, self.places = drive, drive.places
         self.truth = [truth and len(car.truth_time) > 1 for car in drive.cars]

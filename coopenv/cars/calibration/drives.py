@@ -64,7 +64,7 @@ class CarDrive:
 
 
 @dataclass(frozen=True)
-class Drive:
+class CalibrationDrive:
     """What a calibration reads."""
 
     cars: tuple[CarDrive, ...]
@@ -115,14 +115,14 @@ def car_of(
     return car
 
 
-def drive_of_bag(bag: "Bag") -> Drive:
+def drive_of_bag(bag: "Bag") -> CalibrationDrive:
     """Return the drive of bags. Raises DataError: a car has too few sightings."""
     scenario, binding, led = bag.scenario, bag.binding, bag.binding.leaders.values()
     static = [i for i, m in enumerate(scenario.landmarks) if m.motion.kind == "static" and i not in led]
     number = {marker: static.index(target) for marker, target in binding.targets.items() if target in static}
     cars = tuple(_of_samples(bag, name, vehicle, number) for name, vehicle in binding.cars.items())
     names = tuple(scenario.landmarks[i].name for i in static)
-    return Drive(cars, names, marker_places(scenario.landmarks)[static], scenario)
+    return CalibrationDrive(cars, names, marker_places(scenario.landmarks)[static], scenario)
 
 
 def _of_samples(bag: "Bag", name: str, vehicle: int, number: dict[int, int]) -> CarDrive:
@@ -136,14 +136,14 @@ def _of_samples(bag: "Bag", name: str, vehicle: int, number: dict[int, int]) -> 
     return car_of(bag.scenario, name, vehicle, bag.log.lenses.get(name), ray, bag.where, **found)
 
 
-def drive_of_recording(recording: "Recording", path: Path) -> Drive:
+def drive_of_recording(recording: "Recording", path: Path) -> CalibrationDrive:
     """Return the drive of a log of coopenv. Raises DataError: it is not one of cars, or a car has too few sightings."""
     r = recording
     if r.scenario is None or r.pan is not None:
         raise DataError(f"{path}: calibrate needs a log with its environment and with cameras that do not turn")
     static = np.flatnonzero(np.ptp(r.landmarks, axis=0).max(axis=-1, initial=0.0) < 1e-9)
     names = tuple(r.setups[0].target_names[i] for i in static)
-    return Drive(tuple(_of_vehicles(r, r.scenario, static, path)), names, r.landmarks[0, static], r.scenario)
+    return CalibrationDrive(tuple(_of_vehicles(r, r.scenario, static, path)), names, r.landmarks[0, static], r.scenario)
 
 
 def _of_vehicles(r: "Recording", scenario: Scenario, static: NDArray[np.int64], path: Path) -> Iterator[CarDrive]:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import ks_2samp
 
 from coopenv.base.errors import DataError, check_one_of
-from coopenv.cars.calibration import Row, tables_text
+from coopenv.cars.calibration import ConstantRow, tables_text
 from coopenv.cars.calibration.batch import deviation, stated_rate
 from coopenv.cars.calibration.response import DEAD_BAND, KINDS, Response, constants_of
 from coopenv.cars.fake import USUAL, FakeSettings
@@ -46,7 +46,7 @@ class Identified:
     """The result."""
 
     car: str
-    rows: tuple[Row, ...]
+    rows: tuple[ConstantRow, ...]
     distances: tuple[Distance, ...]
 
 
@@ -69,9 +69,9 @@ def identify(bag: "Bag", car: str | None = None) -> Identified:
     rows = []
     for kind, old, value, error, beyond in zip(KINDS, given, found.x, found.error, found.beyond, strict=True):
         finding = BEYOND if beyond else "" if 0.0 < error < kind.prior / np.sqrt(2.0) else UNKNOWN
-        rows.append(Row(kind.name, kind.unit, old, old if finding == UNKNOWN else value, error, finding))
+        rows.append(ConstantRow(kind.name, kind.unit, old, old if finding == UNKNOWN else value, error, finding))
     low, high = found.dead
-    rows.append(Row(DEAD_BAND, "m/s", limits.dead_band, (low + high) / 2, (high - low) / np.sqrt(12.0), ""))
+    rows.append(ConstantRow(DEAD_BAND, "m/s", limits.dead_band, (low + high) / 2, (high - low) / np.sqrt(12.0), ""))
     rows += [*_noise(bag, vehicle, response, found.rest), *_links(sent[car], bag, vehicle)]
     drives = [s for s in samples if isinstance(s.value, MotionCommand)]
     return Identified(car, tuple(rows), tuple(_distances(bag, car, rows, sent[car], drives)))
@@ -89,13 +89,13 @@ def _given(limits: Any, name: str) -> float:
     return float(by_the_environment.get(name, getattr(USUAL, name) or 0.0))
 
 
-def _level(name: str, unit: str, given: float, measure: Callable[[Array], float], values: Array) -> Row:
+def _level(name: str, unit: str, given: float, measure: Callable[[Array], float], values: Array) -> ConstantRow:
     """Return what is measured of values, with the standard error by parts of the drive."""
     parts = [measure(part) for part in np.array_split(values, PARTS)]
-    return Row(name, unit, given, measure(values), float(np.std(parts, ddof=1)) / np.sqrt(PARTS), "")
+    return ConstantRow(name, unit, given, measure(values), float(np.std(parts, ddof=1)) / np.sqrt(PARTS), "")
 
 
-def _noise(bag: "Bag", vehicle: int, response: Response, rest: Sequence[Array]) -> Iterator[Row]:
+def _noise(bag: "Bag", vehicle: int, response: Response, rest: Sequence[Array]) -> Iterator[ConstantRow]:
     """Yield the noise of wheels and gyro, as the environment states it."""
     noise, rate = bag.scenario.noises[vehicle], stated_rate(bag.scenario, vehicle)
     for name, (time, _), left in zip(("velocity", "angular_velocity"), response.series, rest, strict=False):
@@ -104,7 +104,7 @@ def _noise(bag: "Bag", vehicle: int, response: Response, rest: Sequence[Array]) 
         yield _level(f"noise.{name}", unit, getattr(noise, name), deviation, scale * np.diff(left)[:, None])
 
 
-def _links(sent: Sent, bag: "Bag", vehicle: int) -> Iterator[Row]:
+def _links(sent: Sent, bag: "Bag", vehicle: int) -> Iterator[ConstantRow]:
     """Yield rates, jitter, loss and delay of the sensors' messages, and noise and misses of the camera."""
     camera, steps, delays = bag.scenario.cameras[vehicle], [], []
     for role in SENSORS:
@@ -177,7 +177,9 @@ def _quantities(sent: Sent) -> Iterator[tuple[str, Array]]:
     yield "bearing, noise", _sightings(sent)[0]
 
 
-def _distances(bag: "Bag", car: str, rows: Sequence[Row], sent: Sent, drives: Sequence[Sample]) -> Iterator[Distance]:
+def _distances(
+    bag: "Bag", car: str, rows: Sequence[ConstantRow], sent: Sent, drives: Sequence[Sample]
+) -> Iterator[Distance]:
     """Yield how far fakes with the same commands are from the bag."""
     end = drives[0].stamp + round(COMPARED * 1e9)
     commands = [(s.stamp, s.value) for s in drives if s.stamp < end and isinstance(s.value, MotionCommand)]
@@ -197,7 +199,7 @@ def _distances(bag: "Bag", car: str, rows: Sequence[Row], sent: Sent, drives: Se
             yield Distance(name, len(value), *(float(ks_2samp(*pair).statistic) for pair in pairs))
 
 
-def tables(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]:
+def tables(rows: Sequence[ConstantRow]) -> tuple[dict[str, float], dict[str, float]]:
     """Return overrides of the environment, and settings of the fake, that the drive determines."""
     known = {row.name: float(f"{row.value:.6g}") for row in rows if row.finding != UNKNOWN}
     fake = {name.split(".")[1]: value for name, value in known.items() if name.startswith("fake.")}

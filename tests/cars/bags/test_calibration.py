@@ -14,7 +14,7 @@ import pytest
 from coopenv.base.errors import DataError
 from coopenv.cars.bags.topic_map import Correction
 from coopenv.cars.calibration import Calibrated, calibrate, toml_text
-from coopenv.cars.calibration.drives import CarDrive, Drive
+from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive
 from coopenv.cars.vision import Calibration, rays
 from coopenv.cli import main
 from coopenv.scenario import load_scenario
@@ -83,7 +83,7 @@ def drive(
     late: float = 0.0,
     truth_late: float = 0.0,
     seen_by: Calibration = LENS,
-) -> Drive:
+) -> CalibrationDrive:
     """Return the drive as it looks to a calibration that is given these constants."""
     tracks = dict(measured(seen_by))
     seen = tracks.pop("seen")
@@ -104,7 +104,7 @@ def drive(
         **{**tracks, "truth_time": tracks["truth_time"] + truth_late},
     )
     names = tuple(f"M{i}" for i in range(len(markers)))
-    return Drive((car,), names, markers, load_scenario("svea_crossing"))
+    return CalibrationDrive((car,), names, markers, load_scenario("svea_crossing"))
 
 
 def off(result: Calibrated, name: str, true: float) -> float:

@@ -16,7 +16,7 @@ from numpy.testing import assert_array_equal
 from coopenv import DataError
 from coopenv.base.errors import DataWarning
 from coopenv.cars.bags import Bag
-from coopenv.cars.bags.clocks import Signal, delay_of, jumps, lead_of_bearings, lead_of_motion, outlying, turn_of
+from coopenv.cars.bags.clocks import SampledSignal, delay_of, jumps, lead_of_bearings, lead_of_motion, outlying, turn_of
 from coopenv.observers import Recording, run
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
@@ -103,10 +103,10 @@ def test_leads_of_gyro_and_camera(offset: float) -> None:
     """The car turns on the spot, so that bearings are known in closed form; the gyro has a bias and a wrong scale."""
     rng = np.random.default_rng(2)
     t = np.arange(0.0, 25.0, 0.005)
-    gyro = Signal.of_rates(t - offset, 1.03 * turning(t) + 0.02 + rng.normal(0.0, 0.02, len(t)))
+    gyro = SampledSignal.of_rates(t - offset, 1.03 * turning(t) + 0.02 + rng.normal(0.0, 0.02, len(t)))
     frames = np.arange(0.02, 25.0, 1 / 30)
-    truth = Signal(t[::2], np.column_stack([0.0 * t[::2], 0.0 * t[::2], heading(t[::2])]))
-    found = lead_of_motion(gyro, Signal(t[::2], heading(t[::2]) + rng.normal(0.0, 0.002, len(t[::2]))))
+    truth = SampledSignal(t[::2], np.column_stack([0.0 * t[::2], 0.0 * t[::2], heading(t[::2])]))
+    found = lead_of_motion(gyro, SampledSignal(t[::2], heading(t[::2]) + rng.normal(0.0, 0.002, len(t[::2]))))
     assert found is not None and abs(found.seconds - offset) < max(0.003, 4.0 * found.error) < 0.02
     places = np.array([[3.0, 1.0], [-2.0, 2.0], [1.0, -4.0]])
     rows = [(time, np.arctan2(y, x) - heading(time), x, y) for time in frames for x, y in places]
@@ -124,8 +124,8 @@ def test_leads_of_gyro_and_camera(offset: float) -> None:
 def test_a_motion_that_tells_nothing_has_no_lead() -> None:
     t = np.arange(0.0, 20.0, 0.01)
     rng = np.random.default_rng(3)
-    steady, noise = Signal(t, 0.3 * t), Signal.of_rates(t, rng.normal(0.0, 0.05, len(t)))
-    assert lead_of_motion(noise, steady) is None and lead_of_motion(noise, Signal(t, heading(t))) is None
+    steady, noise = SampledSignal(t, 0.3 * t), SampledSignal.of_rates(t, rng.normal(0.0, 0.05, len(t)))
+    assert lead_of_motion(noise, steady) is None and lead_of_motion(noise, SampledSignal(t, heading(t))) is None
 
 
 @pytest.mark.parametrize("offset", [-0.6, 0.0, 0.4, 0.7])
@@ -133,8 +133,10 @@ def test_an_even_speed_after_the_start_has_no_wrong_lead(offset: float) -> None:
     """Without the start nearly any offset explains as much."""
     t, rng = np.arange(0.0, 12.0, 0.02), np.random.default_rng(4)
     speed = np.clip(0.8 * (t - 0.3), 0.0, 0.4)
-    truth = Signal(t, np.cumsum(speed) * 0.02 + rng.normal(0.0, 2e-4, len(t)))
-    wheel = Signal.of_rates(t - offset, 0.97 * speed * (1.0 + 0.02 * np.sin(0.4 * t)) + rng.normal(0.0, 2e-3, len(t)))
+    truth = SampledSignal(t, np.cumsum(speed) * 0.02 + rng.normal(0.0, 2e-4, len(t)))
+    wheel = SampledSignal.of_rates(
+        t - offset, 0.97 * speed * (1.0 + 0.02 * np.sin(0.4 * t)) + rng.normal(0.0, 2e-3, len(t))
+    )
     found = lead_of_motion(wheel, truth)
     assert found is None or abs(found.seconds - offset) < 4.0 * found.error
 
