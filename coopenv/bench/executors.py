@@ -43,7 +43,7 @@ NOT_RUN = "; its remaining records were not run"
 
 
 @dataclass(frozen=True)
-class Limits:
+class ProcessLimits:
     """What an observer may use on one record."""
 
     seconds: float = 1800.0
@@ -111,7 +111,7 @@ class _Worker:
         memory = sum(member.memory_info().rss for member in family) / 2**20
         return sum(time.user + time.system for time in times), monotonic(), memory
 
-    def excess(self, limits: Limits, where: str) -> tuple[str, str] | None:
+    def excess(self, limits: ProcessLimits, where: str) -> tuple[str, str] | None:
         """Return the limit that the present part exceeds, in words, and the end of the reason; None: no limit."""
         with suppress(psutil.Error):  # it has ended, and its pipe with it
             time, clock, memory = (now - then for now, then in zip(self.measured(), self.before, strict=True))
@@ -136,7 +136,7 @@ class _Worker:
 class Pool:
     """Workers, and the tasks that wait for one."""
 
-    def __init__(self, tasks: Sequence[Any], jobs: int, limits: Limits | None) -> None:
+    def __init__(self, tasks: Sequence[Any], jobs: int, limits: ProcessLimits | None) -> None:
         """Take tasks such as `judge.Task`; without limits whatever a part raises ends all."""
         self.tasks, self.jobs, self.limits = tasks, jobs, limits
         self.waiting = deque(range(len(tasks)))
@@ -247,7 +247,7 @@ class Local:
     """Processes of this machine, or this very process where one is enough."""
 
     jobs: int
-    limits: Limits | None = None
+    limits: ProcessLimits | None = None
     """Of observers, in `coopenv.bench.observers.judge.judge_all`; None: none, and they may run in this process."""
 
     def __post_init__(self) -> None:
@@ -374,7 +374,7 @@ def find_executor(
             raise CoopenvError(f"--address {address}: only --engine ray has an address")
         both = {"seconds": seconds, "mebibytes": mebibytes}
         given = {key: value for key, value in both.items() if value is not None}
-        return Local(jobs or available_cores(), Limits(**given) if given or jobs != 1 else None)
+        return Local(jobs or available_cores(), ProcessLimits(**given) if given or jobs != 1 else None)
     for option, value in (("--jobs", jobs), ("--seconds", seconds), ("--memory", mebibytes)):
         if value is not None:
             raise CoopenvError(f"{option} {value:g}: with --engine ray the cluster decides")

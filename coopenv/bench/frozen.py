@@ -24,7 +24,7 @@ from rich.table import Table
 from coopenv.base.errors import CoopenvError, ScenarioWarning, check_one_of, listed
 from coopenv.base.format import in_parentheses, jsonable, number
 from coopenv.base.installation import data_directory, is_reference, versions
-from coopenv.bench.executors import Limits, Local, check_imports
+from coopenv.bench.executors import Local, ProcessLimits, check_imports
 from coopenv.bench.observers.comparison import Comparison, Plan
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.judge import judge_all
@@ -91,9 +91,9 @@ class Frozen:
         return range(first, first + self.definition["seeds"])
 
     @property
-    def limits(self) -> Limits:
+    def limits(self) -> ProcessLimits:
         """Of every observer."""
-        return Limits(self.definition["seconds"], self.definition["memory"])
+        return ProcessLimits(self.definition["seconds"], self.definition["memory"])
 
     def scenes(self, names: Sequence[str] = ()) -> list[FrozenScene]:
         """Return scenes by name, without names all of them. Raises CoopenvError: there is none of a name."""
@@ -122,7 +122,7 @@ class Frozen:
         observers: Sequence[str],
         names: Sequence[str],
         jobs: int,
-        limits: Limits,
+        limits: ProcessLimits,
         on_progress: Callable[[float], None],
     ) -> dict[str, Any]:
         """Return the content of the result file of observers in some scenes, all without names."""
@@ -158,7 +158,7 @@ class Frozen:
         """Of the definition."""
         return sha256(self._text.encode()).hexdigest()
 
-    def _remarks(self, found: Mapping[str, Any], limits: Limits) -> list[str]:
+    def _remarks(self, found: Mapping[str, Any], limits: ProcessLimits) -> list[str]:
         """Return why a result is not comparable with that of the zoo; empty where it is."""
         remarks, frozen = [], self.zoo["scenes"]
         if self.digest != self.zoo.get("definition"):

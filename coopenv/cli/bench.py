@@ -202,13 +202,13 @@ def bench_v1(
     from coopenv.base.format import json_text
     from coopenv.base.installation import available_cores
     from coopenv.bench import frozen
-    from coopenv.bench.executors import Limits
+    from coopenv.bench.executors import ProcessLimits
     from coopenv.runs.console import Progress
 
     check_file(out)
     benchmark, log = frozen.Frozen("v1"), options.console(stderr=True)
     usual = benchmark.limits
-    limits = Limits(seconds or usual.seconds, memory or usual.mebibytes)
+    limits = ProcessLimits(seconds or usual.seconds, memory or usual.mebibytes)
     with Progress(log, "bench v1", total=1.0) as progress:
         names, some = options.words(observers), options.words(scenes)
         result = benchmark.run(names, some, jobs or available_cores(), limits, progress.update)

@@ -14,7 +14,7 @@ import pytest
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import ONE_THREAD
-from coopenv.bench.executors import Limits, Local, find_executor, reach
+from coopenv.bench.executors import Local, ProcessLimits, find_executor, reach
 
 THREADS = list(ONE_THREAD)
 
@@ -42,8 +42,8 @@ def test_processes_compute_with_one_thread(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_one_job_is_this_process_unless_limits_are_given() -> None:
     assert find_executor("local", 1) == Local(1)
-    assert find_executor("local", 2) == Local(2, Limits())
-    assert find_executor("local", 1, seconds=5.0) == Local(1, Limits(seconds=5.0))
+    assert find_executor("local", 2) == Local(2, ProcessLimits())
+    assert find_executor("local", 1, seconds=5.0) == Local(1, ProcessLimits(seconds=5.0))
 
 
 def test_what_cannot_be_sent_to_a_process_is_told() -> None:

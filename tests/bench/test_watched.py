@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from coopenv.base.errors import CoopenvError
-from coopenv.bench.executors import NOT_RUN, Limits, _work, find_executor
+from coopenv.bench.executors import NOT_RUN, ProcessLimits, _work, find_executor
 from coopenv.bench.frozen import Frozen, report
 from coopenv.cli import main
 from tests.helpers.commands import refused
@@ -128,7 +128,7 @@ def test_an_observer_that_takes_too_long_is_not_tried_in_other_scenes(
     monkeypatch.chdir(tmp_path)
     benchmark, names = Frozen("v1"), ["lane", "ring"]
     observers = ["own.py:MyLoops", "own.py:MyRaises"]
-    result = benchmark.run(observers, names, 1, Limits(seconds=2.0), lambda share: None)
+    result = benchmark.run(observers, names, 1, ProcessLimits(seconds=2.0), lambda share: None)
     rows = {(row["observer"], row["scene"]): row for row in result["rows"]}
     log = (tmp_path / "log").read_text().split()
     for name, started, seeds in (("Loops", ["lane"], 1), ("Raises", names, 4)):
