@@ -53,7 +53,7 @@ PATIENCE = 5.0
 """s that the process may take to end."""
 
 
-class Sumo(TrafficProgram):
+class SumoProgram(TrafficProgram):
     """A simulation of SUMO whose vehicles are the scenario's, in its order.
 
     A driven vehicle begins where SUMO inserts it on its route. It is in the hands of actions (`take`) or of SUMO

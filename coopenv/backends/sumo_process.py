@@ -16,7 +16,7 @@ Rows = tuple["array[float]", "array[float]"]
 NAN = float("nan")
 
 
-class Traffic:
+class SumoTraffic:
     """One simulation, and which of its vehicles are those of a scenario."""
 
     def __init__(self) -> None:
@@ -120,7 +120,7 @@ def main() -> None:
     traffic = None
     for line in sys.stdin.buffer:
         try:
-            traffic = traffic or Traffic()
+            traffic = traffic or SumoTraffic()
             request = json.loads(line)
             own, others = getattr(traffic, request.pop("do"))(**request)
             replies.write(json.dumps({"own": len(own) // 4, "others": len(others) // 6}).encode() + b"\n")

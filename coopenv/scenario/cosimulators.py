@@ -71,7 +71,7 @@ class Sumo(Cosimulator):
     """Network, routes and traffic of SUMO, see docs/sumo.md."""
 
     title = "SUMO"
-    program = "coopenv.backends.sumo:Sumo"
+    program = "coopenv.backends.sumo:SumoProgram"
 
     most_vehicles: int = Field(default=1_000, ge=0, le=10_000)
     """Vehicles on its road at most, besides those of this file: the traffic that only occludes and collides."""
@@ -133,7 +133,7 @@ Shape = np.ndarray
 
 
 @dataclass
-class Network:
+class SumoNetwork:
     """What is read of a network."""
 
     center: tuple[float, float] = (0.0, 0.0)
@@ -190,7 +190,7 @@ def _names(given: Any) -> list[str]:
     return [name for name in given if isinstance(name, str)] if isinstance(given, list) else []
 
 
-def _read_network(section: Sumo) -> Network:
+def _read_network(section: Sumo) -> SumoNetwork:
     """Return the network of a section. Raises ScenarioError: it cannot be read."""
     path = Path(section.net)
     with _reading(path, "sumo.net"):
@@ -201,8 +201,8 @@ def _read_network(section: Sumo) -> Network:
 
 
 @lru_cache(maxsize=8)
-def _network(path: Path, modified: int) -> Network:
-    found = Network()
+def _network(path: Path, modified: int) -> SumoNetwork:
+    found = SumoNetwork()
     for element in _elements(path):
         if element.tag == "location":
             left, bottom, right, top = map(float, element.attrib["convBoundary"].split(","))
@@ -257,14 +257,14 @@ def _shape(text: str) -> Shape:
     return kept
 
 
-def _roads(network: Network) -> Iterator[dict[str, Any]]:
+def _roads(network: SumoNetwork) -> Iterator[dict[str, Any]]:
     for lanes in network.lanes.values():
         for shape, width in lanes:
             for a, b in pairwise(shape.tolist()):
                 yield {"start": a, "end": b, "width": width, "marked": False}
 
 
-def _posts(network: Network, height: float) -> Iterator[dict[str, Any]]:
+def _posts(network: SumoNetwork, height: float) -> Iterator[dict[str, Any]]:
     """Yield a landmark at the right of every stop line."""
     into = [edge for edge, junction in network.goes_to.items() if junction not in network.dead_ends]
     for k, edge in enumerate(into):
@@ -338,7 +338,7 @@ def route_edges(section: Sumo) -> dict[str, list[str]]:
     return found
 
 
-def _route(network: Network, name: str, edges: Sequence[str]) -> dict[str, Any]:
+def _route(network: SumoNetwork, name: str, edges: Sequence[str]) -> dict[str, Any]:
     """Return a route along the middle of lanes, from the rightmost one on. Raises ScenarioError: no such way."""
     if lost := [edge for edge in edges if edge not in network.lanes]:
         raise ScenarioError(f"sumo.routes: route {shown(name)}: the network has no edge {shown(lost[0])}")

@@ -160,7 +160,7 @@ def fine(values: np.ndarray, step: float) -> np.ndarray:
     return (np.round(np.asarray(values, float) / step) * step).astype(np.float32)
 
 
-class Batch:
+class MeshNode:
     """A node with copies of a mesh."""
 
     def __init__(self, scene: Any, name: str, mesh: Mesh, colours: np.ndarray, **look: Any) -> None:

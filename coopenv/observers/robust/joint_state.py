@@ -261,7 +261,7 @@ def begin_errors(model: Any, memory: Any, world: int, i: int):
 def walk_errors(model: Any, memory: Any, world: int, i: int, dt: Any):
     """Inflate the covariances of the calibration states by their walk over dt.
 
-    Those of the odometry walk as declared and as found, see `Source`; the mounting, see `CALIBRATION_CHANGE`.
+    Those of the odometry walk as declared and as found, see `SourceMonitor`; the mounting, see `CALIBRATION_CHANGE`.
     """
     noise = model.noise[i]
     walk = odometry_variances(noise.gyro_bias_walk, wp.float64(constants.GYRO_BIAS_WALK), noise.odometry_scale_walk)

@@ -76,7 +76,7 @@ class Member:
 
 
 @wp.struct
-class Source:
+class SourceMonitor:
     """A source of information and the monitor of its fault f, see integrity.py."""
 
     target: wp.int32  # a landmark, or the number of landmarks plus a vehicle; -1: none
@@ -236,7 +236,7 @@ class RobustMemory:
     P: array("WNKK", mat66d)  # blocks of the members' joint covariance
     anchor: array("WN", Anchor)
     search: array("WN", Search)
-    source: array("WNQ", Source)
+    source: array("WNQ", SourceMonitor)
     sensitivity: array("WNQO", mat63d)  # of the own error and the calibration errors by the fault of a source
     drift_effect: array("WNTO", vec6d)  # the errors themselves, if a sender's `drift` is a fault
     information: array("WNQU", mat33d)  # on a fault; and on it and that of a sender, by slot

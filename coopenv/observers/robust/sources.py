@@ -11,7 +11,7 @@ from coopenv.observers.robust.memory import (
     SENDER_SLOTS,
     SOURCES,
     Pose,
-    Source,
+    SourceMonitor,
     fill,
     mat33d,
     mat63d,
@@ -69,7 +69,7 @@ def clear_source(memory: Any, world: int, i: int, q: int):
 def release_slot(memory: Any, world: int, i: int, q: int):
     """Empty a slot."""
     clear_source(memory, world, i, q)
-    memory.source[world, i, q] = Source()
+    memory.source[world, i, q] = SourceMonitor()
     memory.source[world, i, q].target = NO_TARGET
 
 

@@ -11,10 +11,10 @@ from coopenv.viz import meshes
 from coopenv.viz.meshes import (
     NOTHING,
     ROOT,
-    Batch,
     Coloured,
     Ground,
     Look,
+    MeshNode,
     Segments,
     dashes,
     fine,
@@ -48,22 +48,22 @@ class Actors:
         self._scene, self._stage, self._floor = scene, stage, floor
         self._size, self._center = stage.bodies()
         white = np.full((stage.vehicles, 3), 255, np.uint8)
-        self.cars = Batch(scene, f"{ROOT}/cars/true", meshes.car(), colours, **_LIT)
+        self.cars = MeshNode(scene, f"{ROOT}/cars/true", meshes.car(), colours, **_LIT)
         dark = np.tile(rgb(meshes.DARK), (stage.vehicles, 1))
-        self._trims = Batch(scene, f"{ROOT}/cars/trim", meshes.car_trim(), dark, **_LIT)
-        self._pins = Batch(scene, f"{ROOT}/cars/pins", meshes.pin(), colours, flat_shading=True)
-        self._arrows = Batch(scene, f"{ROOT}/cars/front", meshes.arrow(), white, side="double")
-        self._ghosts = Batch(scene, f"{ROOT}/estimates/body", meshes.car(), colours, opacity=0.32, flat_shading=True)
-        self._frames = Batch(scene, f"{ROOT}/estimates/edges", meshes.box(), colours, wireframe=True, opacity=0.5)
-        self._ellipsoids = Batch(scene, f"{ROOT}/ellipsoids", meshes.sphere(), colours, opacity=_HONEST)
+        self._trims = MeshNode(scene, f"{ROOT}/cars/trim", meshes.car_trim(), dark, **_LIT)
+        self._pins = MeshNode(scene, f"{ROOT}/cars/pins", meshes.pin(), colours, flat_shading=True)
+        self._arrows = MeshNode(scene, f"{ROOT}/cars/front", meshes.arrow(), white, side="double")
+        self._ghosts = MeshNode(scene, f"{ROOT}/estimates/body", meshes.car(), colours, opacity=0.32, flat_shading=True)
+        self._frames = MeshNode(scene, f"{ROOT}/estimates/edges", meshes.box(), colours, wireframe=True, opacity=0.5)
+        self._ellipsoids = MeshNode(scene, f"{ROOT}/ellipsoids", meshes.sphere(), colours, opacity=_HONEST)
         self.set_source(source)
         dark = np.tile(rgb(DARK_BLUE), (stage.landmarks, 1))
-        self._dots = Batch(scene, f"{ROOT}/landmarks/dots", meshes.sphere(6), dark, cast_shadow=True)
-        self._poles = Batch(scene, f"{ROOT}/landmarks/poles", meshes.pole(), dark, cast_shadow=True)
+        self._dots = MeshNode(scene, f"{ROOT}/landmarks/dots", meshes.sphere(6), dark, cast_shadow=True)
+        self._poles = MeshNode(scene, f"{ROOT}/landmarks/poles", meshes.pole(), dark, cast_shadow=True)
         bodies = sum(landmark.body is not None for landmark in stage.scenario.landmarks)
-        self._boxes = Batch(scene, f"{ROOT}/landmarks/bodies", meshes.box(), dark[:bodies])
+        self._boxes = MeshNode(scene, f"{ROOT}/landmarks/bodies", meshes.box(), dark[:bodies])
         self._marks = np.zeros((0, 3))
-        self._traffic: Batch | None = None
+        self._traffic: MeshNode | None = None
 
     def set_source(self, source: Origin) -> None:
         """Set the source: ellipsoids of a gain matrix are paler than those of a covariance."""
@@ -93,7 +93,7 @@ class Actors:
         if len(frame.traffic_half):
             if self._traffic is None:
                 grey = np.tile(rgb(TRAFFIC), (len(frame.traffic_half), 1))
-                self._traffic = Batch(self._scene, f"{ROOT}/traffic", meshes.car(), grey, **_LIT)
+                self._traffic = MeshNode(self._scene, f"{ROOT}/traffic", meshes.car(), grey, **_LIT)
             size = np.where(frame.traffic_half[:, :1] > 0.0, 2.0 * frame.traffic_half, np.nan)
             self._traffic.put(placed(frame.traffic_rotation, fine(frame.traffic_position, step), size))
 
@@ -222,7 +222,7 @@ class MessageBeads:
         n = stage.vehicles
         self._stage, self._step = stage, floor.step
         self._receiver, self._sender = (part.ravel() for part in np.indices((n, n)))
-        self._batch = Batch(scene, f"{ROOT}/messages", meshes.sphere(5), colours[self._sender])
+        self._batch = MeshNode(scene, f"{ROOT}/messages", meshes.sphere(5), colours[self._sender])
         self._began = np.full(n * n, -np.inf)
         self._last = np.full(n * n, -1)
         self._time = -np.inf
