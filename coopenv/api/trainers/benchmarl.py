@@ -16,7 +16,7 @@ except ImportError as error:
     raise ImportError(f"coopenv.api.trainers.benchmarl needs BenchMARL: {install_command('benchmarl')}") from error
 
 
-class ActingRows(Transform):
+class ActingLosses(Transform):
     """Takes the rows of vehicles that did not act out of the losses of PPO: no advantage, no error of the critic."""
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -52,7 +52,7 @@ class CooperativeTask(VmasClass):
         return Composite({"state": env.full_observation_spec_unbatched["state"].clone()})
 
     def get_replay_buffer_transforms(self, env: EnvBase, group: str) -> list[Transform]:
-        return [ActingRows()]
+        return [ActingLosses()]
 
     @staticmethod
     def env_name() -> str:
