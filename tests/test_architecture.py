@@ -84,6 +84,12 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
     TopologicalSorter({name: found & MODULES.keys() for name, found in imports.items()}).prepare()
 
 
+def test_a_class_name_means_one_class() -> None:
+    trees = [ast.walk(ast.parse(path.read_text(encoding="utf-8"))) for path in MODULES.values()]
+    names = [node.name for tree in trees for node in tree if isinstance(node, ast.ClassDef) and node.name[0] != "_"]
+    assert not sorted({name for name in names if names.count(name) > 1})
+
+
 LINES_AND_FILES = {
     ".": (128, 2),
     "api": (4400, 19),
