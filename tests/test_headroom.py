@@ -153,7 +153,7 @@ LEAST = {
 }
 """Share of arrivals in each kind of worlds, but for those in which a vehicle lies."""
 LEAST_AT_THE_WORST = 0.5
-"""The same with three times the initial error, or all landmarks in one corner."""
+"""The same with three times the initial error, all landmarks in one corner, or set back: out of many cameras' range."""
 LEAST_IF_ONE_LIES = 0.65
 """The same of `general` where a vehicle lies."""
 
@@ -161,10 +161,11 @@ LEAST_IF_ONE_LIES = 0.65
 @pytest.mark.slow
 @pytest.mark.parametrize(("agent", "environment"), LEAST)
 def test_learned_agents_arrive_whatever_they_sense(agent: str, environment: str) -> None:
-    contest = Contest.of(environment, {}, [agent], 32, 9, stressed=True)
+    contest = Contest.of(environment, {}, [agent], 64, 9, stressed=True)
     found = {name: {r.metric: r.mean for r in results} for name, results in contest.drive().results.items()}
     arrived = {name: rates["arrival_rate"] for name, rates in found.items() if not name.endswith(" lies")}
-    hardest = [arrived.pop(name) for name in [*arrived] if name.endswith(("initial error x 3", "in one corner"))]
+    hard = ("initial error x 3", "in one corner", "as far out")
+    hardest = [arrived.pop(name) for name in [*arrived] if name.endswith(hard)]
     assert min(hardest) >= LEAST_AT_THE_WORST, found
     assert len(arrived) > 8 and min(arrived.values()) >= LEAST[agent, environment], arrived
     if agent == "general":
