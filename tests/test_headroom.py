@@ -138,7 +138,7 @@ def test_one_driver_drives_everywhere_like_its_planner(environment: str) -> None
 
 @pytest.mark.slow
 def test_it_drives_where_it_never_learnt() -> None:
-    driver, lookout = (figures("large_crossing", agent, times=8) for agent in ("general", "peek"))
+    driver, lookout = (figures("large_crossing", agent, times=20) for agent in ("general", "peek"))
     assert driver["arrival_rate"][0] >= 0.9 and driver["e95_m"][0] <= 1.5 * lookout["e95_m"][0]
 
 

@@ -92,9 +92,9 @@ def _sessions() -> WeakSet[Zenoh]:
     closing = threading.Lock()
 
     def close_all() -> None:
-        with closing:
-            for session in list(sessions):
-                session.close()
+        with closing, suppress(KeyError):  # no session is left
+            while True:
+                sessions.pop().close()
 
     def close_at_end() -> None:
         threading.main_thread().join()
