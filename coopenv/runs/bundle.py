@@ -57,7 +57,7 @@ class RunEnd(Section):
 class Manifest(Section):
     """What a run was."""
 
-    format: Literal["coopenv-run 1"] = "coopenv-run 1"
+    format: Literal["coopenv-run 2"] = "coopenv-run 2"
     environment: str
     seed: Count
     policy: str

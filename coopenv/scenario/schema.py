@@ -100,8 +100,9 @@ class Scenario(Section, metaclass=_Loaded):
         Raises:
             ScenarioError: the update does not describe a possible world.
         """
-        own = {} if update is None else {name: getattr(self, name) for name in self.model_fields_set}
-        return type(self)(**{**own, **update}) if update else super().model_copy(deep=deep)
+        copied = super().model_copy(deep=deep)
+        own = {name: getattr(copied, name) for name in self.model_fields_set}
+        return type(self)(**{**own, **update}) if update else copied
 
     @property
     def facts(self) -> dict[str, object]:

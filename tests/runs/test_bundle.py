@@ -200,7 +200,7 @@ def test_what_is_no_such_file_is_refused_in_one_line(folder: Path) -> None:
         (lambda parts: arrays(parts, actions=np.zeros((4, 9, 2))), True, "actions: expected (1, 2) per decision"),
         (lambda parts: parts.update(more=b"x"), True, "not a run: parts more unknown or too large"),
         (lambda parts: parts.pop("arrays.npz") and None, True, "not a run: parts arrays.npz missing"),
-        (manifest("format", "coopenv-run 2"), True, "format: Input should be 'coopenv-run 1', got 'coopenv-run 2'"),
+        (manifest("format", "coopenv-run 1"), True, "format: Input should be 'coopenv-run 2', got 'coopenv-run 1'"),
         (manifest("seed", -1), True, "manifest.json: seed: Input should be greater than or equal to 0"),
         (manifest("end", 3), True, "manifest.json: end: "),
         (manifest("kernels", 5), True, "manifest.json: kernels: "),

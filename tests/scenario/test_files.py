@@ -258,3 +258,10 @@ def test_overrides_do_not_leak_into_the_next_load(file: Path) -> None:
 def test_wrong_overrides(file: Path, key: str, words: str) -> None:
     with pytest.raises(ScenarioError, match=words):
         load_scenario(file, {key: 1.0})
+
+
+def test_a_deep_copy_shares_no_section() -> None:
+    scenario = load_scenario("facade")
+    shallow, deep = (scenario.model_copy(update={"horizon": 3.0}, deep=deep) for deep in (False, True))
+    assert shallow == deep and shallow.horizon == 3.0
+    assert shallow.camera is scenario.camera and deep.camera is not scenario.camera

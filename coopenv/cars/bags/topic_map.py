@@ -237,11 +237,17 @@ class TopicMap(Section):
         return str(beside) if self.environment.endswith(".toml") else self.environment
 
 
+class CalibratedClocks(Section):
+    """Table `clocks` of a calibration."""
+
+    leads: dict[TopicName, Number] = Field(max_length=64)
+
+
 class CalibrationFile(Section):
     """What `coopenv calibrate` writes."""
 
     overrides: dict[str, Any]
-    clocks: ClockSettings
+    clocks: CalibratedClocks
     corrections: dict[Name, Correction] = Field(default={})
     constants: dict[str, Any]
 

@@ -45,6 +45,7 @@ LARGEST_PIXEL, LARGEST_ANGLE, LARGEST_PLACE = 4.0, 0.02, 0.1
 """Standard deviations of residuals (pixels; rad without pixels; m of motion capture) above which nothing fits."""
 UNITS = {"deg/s": 57.3, "km/h": 3.6, "mm/s": 1000.0}
 """Factors of units that are not those of messages."""
+MOVED = 2.0  # rad or m of motion capture, from which its rates are compared
 WITHIN = "within the environment's noise"
 TIGHT = {"marker": 0.01, "truth.frame": 0.01}
 """By the begin of a name, the prior (m, rad) in the estimate of all constants together: the map is surveyed."""
@@ -232,7 +233,7 @@ def _unexplained(batch: Batch, fit: Fit) -> Iterator[str]:
         unit, most = ("rad", LARGEST_ANGLE) if car.lens is None else ("px", LARGEST_PIXEL)
         if seen > most or (truth and place > LARGEST_PLACE):
             off = f"{seen:.3g} {unit}" + (f" and {place:.3g} m of motion capture" if truth else "")
-            check = listed([*_odd_units(car)]) or "check landmarks, markers, frames and clocks"
+            check = listed([*_odd_units(car), "check landmarks, markers, frames and clocks"])
             yield f"{car.name}: no constant explains the residuals ({off}): {check}"
 
 
@@ -247,7 +248,7 @@ def _odd_units(car: CarDrive) -> Iterator[str]:
         way = np.diff(np.interp(time, when, cumulative_trapezoid(rate, when, initial=0.0)))
         step = np.diff(true) if name == "turn rates" else np.abs(np.diff(true))
         factor = float(way @ step / max(float(step @ step), 1e-9))
-        if not 0.5 < factor < 2.0:
+        if np.abs(step).sum() > MOVED and not 0.5 < factor < 2.0:
             unit = next((f" ({unit}?)" for unit, k in UNITS.items() if abs(factor / k - 1.0) < 0.1), "")
             yield f"its {name} are {factor:.3g} times those of motion capture{unit}"
 
@@ -300,9 +301,9 @@ def toml_text(result: Calibrated) -> str:
     batch, leads, tables = result.batch, dict[str, float](), dict[str, Mapping[str, object]]()
     value = batch.base + result.fit.x
     for c, car in enumerate(batch.cars if result.explained else ()):
-        own = value[batch.own(c)]
-        pairs = zip(car.topics[:2], own[[CAMERA_TIME, WHEEL_TIME]], strict=True)
-        leads |= {topic: round(float(late), 5) for (topic, _), late in pairs if topic and abs(late) > FINEST["s"]}
+        own, times = value[batch.own(c)], [CAMERA_TIME, WHEEL_TIME]
+        pairs = zip(car.topics[:2], own[times], batch.base[batch.own(c)][times], strict=True)
+        leads |= {t: round(float(v), 5) for (t, _), v, given in pairs if t and (given or abs(v) > FINEST["s"])}
         if car.topics[0][0]:  # of a bag
             found: Constants = {"wheel_scale": float(own[SCALE]), "gyro_bias": float(own[BIAS])}
             found |= {} if car.lens is None else intrinsics(batch, c, value)

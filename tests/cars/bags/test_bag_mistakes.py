@@ -234,6 +234,14 @@ def test_a_bag_that_is_not_there(name: str, topics: Path) -> None:
         load_map(topics.with_name("nowhere.toml"))
 
 
+def test_offsets_in_a_calibration_are_refused(topics: Path) -> None:
+    old = topics.with_name("old.toml")
+    old.write_text("[overrides]\n[clocks]\nleads = {}\noffsets = { svea3 = 0.1 }\n[constants]\n")
+    topics.write_text('calibration = "old.toml"\n' + topics.read_text())
+    with pytest.raises(TopicMapError, match=r"calibration: old\.toml: clocks\.offsets: unknown key"):
+        load_map(topics)
+
+
 def test_a_folder_that_is_no_bag_is_told_so(topics: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = topics.with_name("empty")
     folder.mkdir()
