@@ -241,7 +241,6 @@ class Evaluation(Contest, Tabular):
 
         `kind` is "error_along_the_way", "time_against_error" or "looking".
         """
-        import coopenv.bench.evaluate  # noqa: F401 (adds its figures)
         from coopenv.viz import figures, style
 
         check_one_of("unknown figure", kind, KINDS)
