@@ -295,7 +295,7 @@ class Stage:
         if not self.sees_a_part:
             return None
         eye = self.eyes(frame)[of]
-        turned = np.array([rotation_of(pan, None) for pan in frame.pan[of]])
+        turned = np.array([rotation_of(pan, None) for pan in frame.pan[of]]).reshape(-1, 3, 3)
         rays = self._fan[of, ::every] @ np.swapaxes(frame.vehicle_rotation[of] @ turned, 1, 2)
         length = free_lengths(eye, rays, self.reach[of], self.buildings)
         return np.concatenate([eye[:, None], eye[:, None] + length[..., None] * rays], axis=1)

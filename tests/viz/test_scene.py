@@ -299,3 +299,10 @@ def test_table_with_protection_levels(overtaking: SceneRecord) -> None:
     level[0] = 1.25, 0.1
     text = table_html(overtaking.source, replace(frame, protection_level=level))
     assert "level [m]" in text and ">1.25</td>" in text and text.count(">-</td>") >= len(level) - 1
+
+
+def test_no_vehicle_has_no_field_of_view() -> None:
+    """A view of one vehicle, which shows some vehicles at a time, has ticks in whose turn none is."""
+    engine = played("facade", {}, 0)
+    views = Stage(engine.backend.scenario).fields_of_view(Frame.of(engine), of=slice(1, 1))
+    assert views is not None and views.shape[0] == 0 and views.shape[2] == 3
