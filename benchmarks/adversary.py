@@ -21,8 +21,8 @@ import numpy as np
 from rich.console import Console
 
 import coopenv
-from benchmarks.options import at_least
-from coopenv.base.errors import EVALUATION_SEEDS, CoopenvError
+from benchmarks.options import at_least, status_of
+from coopenv.base.errors import EVALUATION_SEEDS
 from coopenv.base.format import in_parentheses
 from coopenv.bench.observers.changes import DIRECTION
 from coopenv.bench.observers.rows import standard_error
@@ -256,12 +256,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train, measure and print; return the exit status: 0, or 2 after a mistake in the input."""
     asked = parser().parse_args(arguments)
-    try:
-        measure(asked)
-    except CoopenvError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return status_of(measure, asked)
 
 
 def measure(asked: argparse.Namespace) -> None:

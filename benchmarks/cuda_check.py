@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from itertools import product
@@ -148,6 +148,11 @@ def _numbers(pattern: str, text: str) -> list[int]:
     return [int(number) for number in re.findall(pattern, text)]
 
 
+def module_name(module: Any) -> str:
+    """Return the name of a Warp module in tables."""
+    return str(module.name.split("coopenv.")[-1])
+
+
 def check_module(module: Any, out: Path, architectures: Sequence[int], ptxas: str) -> Rows:
     """Return a row per architecture, from the folder of the module where an earlier run has left it."""
     folder = out / module.get_module_identifier()
@@ -160,7 +165,7 @@ def check_module(module: Any, out: Path, architectures: Sequence[int], ptxas: st
         if str(arch) not in known:
             known[str(arch)] = assemble(ptx, arch, ptxas)
             replace_text(kept, json_text(known))
-    common = {"module": module.name.split("coopenv.")[-1], **{key: known[key] for key in ("ptx_s", "ptx_bytes")}}
+    common = {"module": module_name(module), **{key: known[key] for key in ("ptx_s", "ptx_bytes")}}
     return [{**common, "arch": arch, **known[str(arch)]} for arch in architectures]
 
 
@@ -187,9 +192,12 @@ def beyond(rows: Rows, allowed: dict[str, dict[str, int]]) -> list[str]:
     return list(dict.fromkeys(lines))
 
 
-def accept(rows: Rows) -> None:
-    """Write the limits that the modules of rows need, with room; a thread has 255 registers at most."""
-    allowed = limits()
+def accept(rows: Rows, known: Collection[str]) -> None:
+    """Write the limits that the modules of rows need, with room, beside those of the others that are known.
+
+    A thread has 255 registers at most.
+    """
+    allowed = {name: limit for name, limit in limits().items() if name in known}
     for name in {row["module"] for row in rows}:
         most = {need: max(row[need] for row in rows if row["module"] == name) for need in NEEDS}
         room = {need: round(ROOM * most[need]) for need in NEEDS}
@@ -212,13 +220,14 @@ def report(rows: Rows) -> str:
     return table(["module", "compile [s]", "registers", "stack [B]", "spills [B]"], cells)
 
 
-def put(rows: Rows, page: Path) -> None:
-    """Put the table into a page between its two marks; rows of other modules stay."""
+def put(rows: Rows, page: Path, known: Collection[str]) -> None:
+    """Put the table into a page between its two marks; rows of other modules that are known stay."""
     before, _, rest = page.read_text(encoding="utf-8").partition(BEGIN)
     old, _, after = rest.partition(END)
     head, rule, *new = report(rows).splitlines()
     lines = {line.split("`")[1]: line for line in (*old.splitlines(), *new) if line.startswith("| `")}
-    text = "\n".join([head, rule, *(line for _, line in sorted(lines.items()))])
+    names = {name.rpartition(".")[0] for name in known}
+    text = "\n".join([head, rule, *(line for name, line in sorted(lines.items()) if name in names)])
     replace_text(page, f"{before}{BEGIN}\n\n{text}\n\n{END}{after}")
 
 
@@ -230,16 +239,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if asked.accept and (len({*asked.dtype}), len({*asked.arch})) != (len(PRECISIONS), len(ARCHITECTURES)):
             raise CoopenvError("--accept needs both precisions and all architectures: leave out --dtype and --arch")
-        modules = {name: m for p in asked.dtype for name, m in catalogue(p).items() if asked.only.search(name)}
+        known = {name: module for p in asked.dtype for name, module in catalogue(p).items()}
+        modules = [module for name, module in known.items() if asked.only.search(name)]
         if not modules:
             raise CoopenvError(f"--only: no module has '{asked.only.pattern}' in its name")
         cache = asked.out / wp.config.version  # as Warp makes it of WARP_CACHE_PATH
-        for found in check(modules.values(), cache, asked.arch, asked.jobs):
+        for found in check(modules, cache, asked.arch, asked.jobs):
             rows += found
             print(f"{found[0]['module']}: " + "; ".join(_line(row) for row in found), flush=True)
         if asked.accept:
-            accept(rows)
-            put(rows, PAGE)
+            names = {module_name(module) for module in known.values()}
+            accept(rows, names)
+            put(rows, PAGE, names)
         broken = beyond(rows, limits())
     except (CoopenvError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

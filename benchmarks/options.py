@@ -1,7 +1,20 @@
-"""Options of the commands."""
+"""Options and exit status of the commands."""
 
 import argparse
+import sys
 from collections.abc import Callable
+
+from coopenv.base.errors import CoopenvError
+
+
+def status_of(work: Callable[[argparse.Namespace], None], asked: argparse.Namespace) -> int:
+    """Do the work that is asked for; return the exit status: 0, or 2 after a mistake in the input, in one line."""
+    try:
+        work(asked)
+    except CoopenvError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
 
 
 def at_least(low: float) -> Callable[[str], float]:

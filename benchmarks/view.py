@@ -12,6 +12,7 @@ from functools import partial
 from time import monotonic, process_time, thread_time
 from typing import NamedTuple
 
+from benchmarks.options import status_of
 from coopenv.base.errors import CoopenvError
 from coopenv.runs.live import EngineReel
 from coopenv.runs.scenes import driver_of, open_source
@@ -37,12 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--observer", default=None)
     parser.add_argument("--seconds", type=float, default=15.0)
     asked = parser.parse_args(arguments)
-    try:
-        measure(asked)
-    except CoopenvError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return status_of(measure, asked)
 
 
 def measure(asked: argparse.Namespace) -> None:

@@ -92,7 +92,7 @@ def test_a_class_name_means_one_class() -> None:
 
 LINES_AND_FILES = {
     ".": (128, 2),
-    "api": (4400, 19),
+    "api": (4402, 19),
     "backends": (3825, 17),
     "base": (1896, 10),
     "bench": (5424, 18),

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.options import status_of
 from benchmarks.planar.changes import blindfolded, changed, clocks, drifting, hidden, misread, odometry, part
 from benchmarks.planar.lies import Drifting, Replaying
 from coopenv.backends.mrclam import VARIANTS, Dataset, load_dataset, recording_of
-from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Array
 from coopenv.observers.planar import LEAST_LOST_STD, PlanarEkf, PlanarRobust
 from coopenv.observers.recording import Recording
@@ -49,12 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print; return the exit status: 0, or 2 after a mistake in the input."""
     asked = parser().parse_args(arguments)
     warnings.simplefilter("ignore")
-    try:
-        {"changed": changes, "barriers": barriers, "lies": lies, "carried": carried}[asked.what](asked)
-    except CoopenvError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return status_of({"changed": changes, "barriers": barriers, "lies": lies, "carried": carried}[asked.what], asked)
 
 
 def parser() -> argparse.ArgumentParser:

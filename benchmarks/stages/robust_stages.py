@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from benchmarks.options import at_least
-from coopenv.base.errors import CoopenvError
+from benchmarks.options import at_least, status_of
 from coopenv.cli.options import load
 
 STAGES: tuple[tuple[str, tuple[str, ...]], ...] = (
@@ -111,12 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--rounds", type=at_least(2), default=9, help="of which the mean and its standard error (default: 9)"
     )
     asked = parser.parse_args(arguments)
-    try:
-        measure(asked)
-    except CoopenvError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return status_of(measure, asked)
 
 
 def measure(asked: argparse.Namespace) -> None:

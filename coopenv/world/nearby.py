@@ -293,7 +293,7 @@ def place_of_farthest(model: Any, state: Any, world: int, vehicle: int, seen: An
 
 @device_function
 def keep(model: Any, state: Any, world: int, vehicle: int, agent: int, seen: Any):
-    """Keep an agent that is in range; without room it is counted."""
+    """Keep an agent that is in range; that there was no room for one is noted until the next reset."""
     if entry_of(model, state, world, vehicle, agent) >= 0:
         return
     count = state.kept_count[world, vehicle]
@@ -301,7 +301,7 @@ def keep(model: Any, state: Any, world: int, vehicle: int, agent: int, seen: Any
     if count == model.kept:
         last = place_of_farthest(model, state, world, vehicle, seen)
         if last < 0:
-            state.crowded[world, vehicle] += 1
+            state.crowded[world, vehicle] = 1
             return
         entry = state.kept_order[world, vehicle, last]
         count -= 1
@@ -325,7 +325,6 @@ def keep_those_in_range(model: Any, state: Any, world: int, vehicle: int):
     if model.kept == 0 or model.listed == 1:
         return
     own = model.landmarks + vehicle
-    state.crowded[world, vehicle] = 0
     if state.present[world, own] == 0:
         return
     here = state.position[world, own]

@@ -102,20 +102,24 @@ def test_what_is_above_a_limit_is_a_line() -> None:
 
 def test_rows_of_a_part_replace_their_own_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page, csv = tmp_path / "page.md", tmp_path / "limits.csv"
-    csv.write_text("module,ptx_bytes,registers,stack,spills\nb.float32,1,2,3,4\nc.float32,1,2,3,4\n")
+    csv.write_text(
+        "module,ptx_bytes,registers,stack,spills\nb.float32,1,2,3,4\nc.float32,1,2,3,4\ngone.float32,1,2,3,4\n"
+    )
     monkeypatch.setattr("benchmarks.cuda_check.LIMITS", csv)
-    page.write_text(f"above\n{BEGIN}\n\n| module | x |\n|---|---|\n| `b` | 9 |\n| `c` | 9 |\n\n{END}\nbelow\n")
+    page.write_text(
+        f"above\n{BEGIN}\n\n| module | x |\n|---|---|\n| `b` | 9 |\n| `c` | 9 |\n| `gone` | 9 |\n\n{END}\nbelow\n"
+    )
     needs = {"ptx_bytes": 100, "registers": 250, "stack": 2000, "spills": 8}
     rows = [{"module": "b.float32", "arch": 90, "ptx_s": 1.0, "ptxas_s": 1.0, **needs}]
-    accept(rows)
-    put(rows, page)
+    accept(rows, {"b.float32", "c.float32"})
+    put(rows, page, {"b.float32", "c.float32"})
     assert limits() == {
         "b.float32": {"ptx_bytes": 125, "registers": 255, "stack": STACK - 1, "spills": 10},
         "c.float32": {"ptx_bytes": 1, "registers": 2, "stack": 3, "spills": 4},
     }
     text = page.read_text()
     assert text.startswith(f"above\n{BEGIN}\n\n| module | compile [s] |") and text.endswith(f"{END}\nbelow\n")
-    assert "\n| `b` | 2 | 250 | 2000 | 8 |\n| `c` | 9 |\n" in text
+    assert "\n| `b` | 2 | 250 | 2000 | 8 |\n| `c` | 9 |\n" in text and "gone" not in text
 
 
 @needs_ptxas

@@ -46,6 +46,8 @@ class BatchedWorlds(EnvBase):
         self.batch, self.scenario = batch, scenario
         self._seed: int | None = None
         self._agents = [i for i, driver in enumerate(scenario.drivers) if driver is None]
+        acting = [scenario.acting[i] for i in self._agents]
+        self._acts = torch.tensor(acting, device=self.device) | (not any(acting))  # any, where none does
         self.group_map = {GROUP: [scenario.vehicle_names[i] for i in self._agents]}
         rows = (worlds, len(self._agents))
         self._going = torch.zeros(rows, dtype=torch.bool, device=self.device)
@@ -114,7 +116,7 @@ class BatchedWorlds(EnvBase):
         info |= {name: (fresh & (ended == code)).float() for name, code in EVENTS.items()}
         group = {
             "observation": torch.where(acted[..., None], self._field("observation"), 0.0),
-            "mask": self._going.clone(),
+            "mask": self._going & self._acts,
             "info": TensorDict({name: torch.where(acted, each, 0.0) for name, each in info.items()}, acted.shape),
             **flags,
         }

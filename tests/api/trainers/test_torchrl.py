@@ -142,6 +142,14 @@ def test_absent_vehicles_never_act() -> None:
     assert not rollout["vehicle", "observation"].transpose(1, 2)[absent].any()
 
 
+def test_vehicles_of_prescribed_motion_never_act() -> None:
+    env = batched_env("behind_truck", num_worlds=2, seed=3)
+    rollout = env.rollout(5)
+    acts = torch.tensor(env.scenario.acting)
+    assert acts.tolist() == [False, True]
+    assert (rollout["vehicle", "mask"] == acts).all() and (rollout["next", "vehicle", "mask"] == acts).all()
+
+
 def test_seeds() -> None:
     first, second, other = (
         batched_env("open_square", num_worlds=2, seed=seed).reset()["vehicle", "observation"] for seed in (7, 7, 8)

@@ -276,8 +276,8 @@ def test_files_of_others_are_told_from_ours(
 def test_the_camera_tells_its_own_calibration(tmp_path: Path) -> None:
     matrices: dict[str, Any] = {"k": [400.0, 0, 160, 0, 410.0, 100, 0, 0, 1], "d": np.zeros(5)}
     fields = {**matrices, "height": 208, "width": 316, "distortion_model": "plumb_bob"}
-    told = bags.Message("/agent8/pixy_node/camera_info", "sensor_msgs/msg/CameraInfo", 0, 0, fields)
-    bag = opened(tmp_path, MAP, [*short(), told], "mcap")
+    info = bags.Message("/agent8/pixy_node/camera_info", "sensor_msgs/msg/CameraInfo", 0, 0, fields)
+    bag = opened(tmp_path, MAP, [*short(), info], "mcap")
     frame = next(sample.value for sample in bag.log.samples if isinstance(sample.value, Detections))
     blocks = next(m for m in short() if "objectsInfo" in m.topic).fields["objects"]
     largest = {b["signature"]: b for b in blocks if b["width"] == 9}
@@ -291,11 +291,11 @@ def test_the_camera_tells_its_own_calibration(tmp_path: Path) -> None:
 def test_corrections_count_more_than_what_the_car_publishes(tmp_path: Path) -> None:
     fields = {"k": [400.0, 0, 160, 0, 410.0, 100, 0, 0, 1], "d": np.zeros(5)}
     fields |= {"height": 208, "width": 316, "distortion_model": "plumb_bob"}
-    told = bags.Message("/agent8/pixy_node/camera_info", "sensor_msgs/msg/CameraInfo", 0, 0, fields)
+    info = bags.Message("/agent8/pixy_node/camera_info", "sensor_msgs/msg/CameraInfo", 0, 0, fields)
     lines = (
         "[corrections.svea3]\nfocal_length = [200.0, 201.0]\ndistortion = [0.1, 0.0, 0.0, 0.0]\nwheel_scale = 0.25\n"
     )
-    given = [*short(), told]
+    given = [*short(), info]
     plain, bag = opened(tmp_path, MAP, given), opened(tmp_path / "new", MAP + lines + "gyro_bias = 0.5\n", given)
     lens = replace(plain.log.lenses["svea3"], focal_length=(200.0, 201.0), distortion=(0.1, 0.0, 0.0, 0.0))
     assert bag.log.lenses["svea3"] == lens and lens.principal_point == (160.0, 100.0)
@@ -331,9 +331,9 @@ def test_motion_capture_far_from_the_map_is_warned_of(tmp_path: Path) -> None:
 
 def test_a_camera_that_says_it_is_not_calibrated_has_the_calibration_of_the_environment(tmp_path: Path) -> None:
     fields = {"k": np.zeros(9), "d": [], "height": 208, "width": 316, "distortion_model": ""}
-    told = bags.Message("/agent8/pixy_node/camera_info", "sensor_msgs/msg/CameraInfo", 0, 0, fields)
+    info = bags.Message("/agent8/pixy_node/camera_info", "sensor_msgs/msg/CameraInfo", 0, 0, fields)
     with pytest.warns(DataWarning, match=r"camera_info: says that the camera is not calibrated \(k is zero\)"):
-        bag = opened(tmp_path / "with", MAP, [*short(), told], "mcap")
+        bag = opened(tmp_path / "with", MAP, [*short(), info], "mcap")
     assert bag.log.lenses == opened(tmp_path / "without", MAP, short(), "mcap").log.lenses
 
 

@@ -117,12 +117,12 @@ def test_cars_come_and_go() -> None:
             seen = seen_by(here)
             wait_until(lambda: set(seen) == {(presence_of("svea7"), True), (presence_of("svea1"), True)})
             assert len(mentioning(endpoint)) == 3
-            told = health(SHIPPED, endpoint).output.splitlines()
-            assert told[0] == "svea7: gate disarmed, 0 commands accepted, 0 messages refused"
+            lines = health(SHIPPED, endpoint).output.splitlines()
+            assert lines[0] == "svea7: gate disarmed, 0 commands accepted, 0 messages refused"
             stands = "from 0.5 m/s to a stand 0.8 s and 0.28 m, with safety.deceleration"
-            assert told[1] == f"svea7: station or radio silent: {stands}"
-            assert [line.split(": ")[1] for line in told[1:4]] == [*Safety().stopping(0.5, SVEA.command)]
-            assert told[4].startswith("svea7: not tried from outside: tcp/127.0.0.1:7447: no Zenoh there")
+            assert lines[1] == f"svea7: station or radio silent: {stands}"
+            assert [line.split(": ")[1] for line in lines[1:4]] == [*Safety().stopping(0.5, SVEA.command)]
+            assert lines[4].startswith("svea7: not tried from outside: tcp/127.0.0.1:7447: no Zenoh there")
         raise ZeroDivisionError
     assert not mentioning(endpoint)
 
