@@ -23,7 +23,7 @@ def main() -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="escaped")  # file names need not be text
     try:
-        from coopenv.cli import main
+        from coopenv.cli.app import main
 
         status = main()
     except BaseException:

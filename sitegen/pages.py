@@ -50,7 +50,7 @@ def mirrored() -> dict[str, str]:
 
 def command_line() -> str:
     """Return the page of the command line, as typer describes it."""
-    command = [sys.executable, "-m", "typer", "coopenv.cli", "utils", "docs", "--name", "coopenv"]
+    command = [sys.executable, "-m", "typer", "coopenv.cli.app", "utils", "docs", "--name", "coopenv"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     text = done.stdout.replace("# `coopenv`\n", "# Command line\n", 1)
     text = text.replace("**Usage**:\n\n```console\n$ ", "```console\n$ ")

@@ -12,7 +12,7 @@ import griffe
 import typer
 
 from coopenv.base.installation import environment_id, list_envs
-from coopenv.cli import app
+from coopenv.cli.app import app
 from sitegen.mirror import ROOT
 
 FILE = ROOT / "tests" / "public_names.txt"

@@ -93,11 +93,11 @@ def test_a_class_name_means_one_class() -> None:
 LINES_AND_FILES = {
     ".": (128, 2),
     "api": (4402, 19),
-    "backends": (3825, 17),
+    "backends": (3825, 15),
     "base": (1896, 10),
     "bench": (5424, 18),
-    "cars": (10962, 39),
-    "cli": (2678, 8),
+    "cars": (10964, 41),
+    "cli": (2679, 9),
     "estimation": (1888, 7),
     "evaluation": (495, 3),
     "observers": (11725, 42),
@@ -109,7 +109,7 @@ LINES_AND_FILES = {
     "world": (5603, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
-MOST_FILES = 240
+MOST_FILES = 241
 
 
 def test_wings_keep_their_budgets() -> None:

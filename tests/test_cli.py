@@ -16,7 +16,7 @@ import coopenv
 from coopenv.backends.mcap import write_recording
 from coopenv.base.installation import environment_id, list_agents
 from coopenv.bench.observers.faults import FAULTS, VARIANTS
-from coopenv.cli import failure_status, main
+from coopenv.cli.app import failure_status, main
 from coopenv.cli.options import parse_value
 from coopenv.estimation.observability import Trajectory
 from coopenv.observers.recording import Truth

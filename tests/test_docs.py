@@ -26,7 +26,7 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.learning import read_study
 from coopenv.cars.bags.topic_map import load_map
-from coopenv.cli import app
+from coopenv.cli.app import app
 from coopenv.policies import act, load_agent
 from coopenv.scenario import load_scenario, parse_scenario
 from coopenv.training.settings import Clone, read_settings

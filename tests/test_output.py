@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from coopenv.cli import main
+from coopenv.cli.app import main
 from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, start
 
 AGENTS = """
@@ -230,7 +230,7 @@ import coopenv.policies
 import coopenv.runs.demo
 import coopenv.runs.recorder
 import coopenv.runs.live
-from coopenv.cli import main
+from coopenv.cli.app import main
 
 for command, folder in json.load(sys.stdin):
     if os.fork() == 0:

@@ -34,7 +34,7 @@ def modules_after(statement: str) -> set[str]:
 
 
 @pytest.mark.parametrize(
-    "statement", ["import coopenv", "from coopenv.cli import main; main(['--version']); main(['frobnicate'])"]
+    "statement", ["import coopenv", "from coopenv.cli.app import main; main(['--version']); main(['frobnicate'])"]
 )
 def test_start_loads_no_simulation(statement: str) -> None:
     loaded = modules_after(statement)
@@ -47,7 +47,7 @@ def test_start_loads_no_simulation(statement: str) -> None:
 HELP = """
 sys.orig_argv[1:3] = ['-m', 'coopenv']  # so that nothing is registered with Gymnasium
 import contextlib, io
-from coopenv.cli import app, main
+from coopenv.cli.app import app, main
 from typer.main import get_command
 
 def help_of(command, path):
@@ -71,7 +71,7 @@ def test_the_help_of_every_command_loads_nothing_heavy_and_is_whole() -> None:
 FORKED = """
 import json, os, sys
 sys.orig_argv[1:3] = ["-m", "coopenv"]  # so that nothing is registered with Gymnasium
-from coopenv.cli import main
+from coopenv.cli.app import main
 first, *others = json.loads(sys.argv[1])
 with open(os.devnull, "w") as sys.stdout, open(os.devnull, "w") as sys.stderr:
     main(first.split())  # loads what the others need as well
@@ -206,7 +206,7 @@ def test_every_completed_key_is_one_that_the_loader_knows() -> None:
 
 def test_completion_is_offered_by_the_program() -> None:
     asked = {"_COOPENV_COMPLETE": "complete_bash", "COMP_WORDS": "coopenv run cross", "COMP_CWORD": "2"}
-    command = [sys.executable, "-c", "from coopenv.cli import app; app(prog_name='coopenv')"]
+    command = [sys.executable, "-c", "from coopenv.cli.app import app; app(prog_name='coopenv')"]
     result = subprocess.run(command, env={**os.environ, **asked}, capture_output=True, text=True, check=False)
     assert result.stdout.split() == ["crossing_path", "crossroad:"]
 

@@ -11,7 +11,7 @@ import pytest
 
 import coopenv
 from coopenv.cars.profile import SVEA
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.policies import load_agent
 from tests.helpers.processes import DEADLOCK, ROOT, mentioning, start
 

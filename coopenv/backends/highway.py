@@ -112,6 +112,21 @@ def _creator(name: str) -> Any:
     return creator
 
 
+def __getattr__(name: str) -> Any:
+    """Return a class of highway-env's traffic; highway-env is loaded with the first one (PEP 562).
+
+    Environments of highway-env set parameters of the class of their traffic, and with it those of every other
+    environment in the process. Separate classes keep the worlds of one program apart.
+    """
+    if name not in ("IntersectionTraffic", "Traffic"):
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    from highway_env.vehicle.behavior import IDMVehicle
+
+    own = {"DISTANCE_WANTED": 5.0 + IDMVehicle.LENGTH, "COMFORT_ACC_MAX": 3.0, "COMFORT_ACC_MIN": -5.0}  # m, m/s^2
+    globals()[name] = type(name, (IDMVehicle,), own if name == "Traffic" else {})
+    return globals()[name]
+
+
 def _config(scenario: Scenario, section: Highway, defaults: Mapping[str, Any]) -> dict[str, Any]:
     """Return the configuration of highway-env: the section's own keys, checked, and those of the scenario."""
     rate = int(scenario.rates.camera)
@@ -136,7 +151,7 @@ def _config(scenario: Scenario, section: Highway, defaults: Mapping[str, Any]) -
         "dynamical": section.dynamical,
     }
     return {
-        "other_vehicles_type": f"coopenv.backends.highway_traffic.{kind}",
+        "other_vehicles_type": f"{__name__}.{kind}",
         **{key: list(value) if isinstance(value, tuple) else value for key, value in section.config.items()},
         "action": {"type": "MultiAgentAction", "action_config": drive},
         "observation": {"type": "AttributesObservation", "attributes": []},

@@ -19,7 +19,7 @@ from coopenv.backends.mrclam_dataset import MAX_TRUTH_GAP_S, ROBOTS, Dataset, He
 from coopenv.base.errors import DataError, suggest
 from coopenv.estimation.poses import Array, about_z
 from coopenv.observers.contract import Gains, SensorNoise, Setup
-from coopenv.observers.planar.model import ARC, CALIBRATING, IROBOT_CREATE, PATH, SLOWING, TURN, TURNING, CommandHistory
+from coopenv.observers.planar_model import ARC, CALIBRATING, IROBOT_CREATE, PATH, SLOWING, TURN, TURNING, CommandHistory
 from coopenv.observers.recording import Recording, Truth, check_recording
 
 __all__ = ["VARIANTS", "Dataset", "Variant", "load_dataset", "recording_of"]

@@ -17,7 +17,7 @@ from coopenv.base.installation import list_envs
 if TYPE_CHECKING:
     from coopenv.backends.base import Backend
     from coopenv.backends.worlds import Simulated
-    from coopenv.cars.bags import Bag
+    from coopenv.cars.bags.bag import Bag
     from coopenv.observers.recording import Recording
     from coopenv.scenario import Scenario, ScenarioLike
 
@@ -63,7 +63,7 @@ def is_bag(name: ScenarioLike, topics: str | Path | None = None) -> TypeGuard[st
     if str(name).endswith(BAG_SUFFIXES):
         return True
     if str(name).endswith(LOG_SUFFIX):
-        from coopenv.backends.mcap.format import metadata_names
+        from coopenv.backends.mcap_format import metadata_names
 
         metadata = metadata_names(name)
         if metadata is None or DRIVE in metadata:
@@ -243,6 +243,6 @@ def open_bags(
         raise DataError(f"no such bag: {', '.join(missing)}")
     if topics is None:
         raise DataError(f"{where}: a ROS bag, which needs a map of its topics, --map topics.toml (see docs/bags.md)")
-    from coopenv.cars.bags import Bag
+    from coopenv.cars.bags.bag import Bag
 
     return Bag(names, topics, overrides)

@@ -37,7 +37,7 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
             lists = [n for n in ast.parse(file.read_text(encoding="utf-8")).body if isinstance(n, ast.Assign)]
             if any(ast.unparse(n.targets[0]) == "__all__" and name in ast.literal_eval(n.value) for n in lists):
                 return f" (from {package}.{file.parent.name} import {name})"
-        commands = import_module(cli).app if find_spec(cli := f"{package}.cli") else None
+        commands = import_module(f"{package}.cli.app").app if find_spec(f"{package}.cli") else None
         if commands and name in import_module("typer.main").get_group(commands).commands:
             return f" (in the shell: {package} {name})"
         return suggest(name, module.__all__) or f"; known: {listed(module.__all__, 40)}"

@@ -22,7 +22,7 @@ from coopenv.cars.keys import Signer, library, load_verifier
 from coopenv.cars.profile import GATE_TYPES, VELOCITY, MotionCommand, Role
 from coopenv.cars.readings import Twist, read
 from coopenv.cars.transport import Arrival
-from coopenv.cars.transport.zenoh import Zenoh, certificates_of, open_zenoh
+from coopenv.cars.zenoh import Zenoh, certificates_of, open_zenoh
 
 MOVES = 0.1  # m/s, above the noise of the wheels
 BATCH = 50  # messages between two looks at the car

@@ -10,8 +10,8 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
 from coopenv.base.sections import Section, read_toml, validated, with_tables
-from coopenv.cars.fake import USUAL as DEFAULT_FAKE
-from coopenv.cars.fake import FakeSettings
+from coopenv.cars.fake.settings import USUAL as DEFAULT_FAKE
+from coopenv.cars.fake.settings import FakeSettings
 from coopenv.cars.gate import TIMEOUT
 from coopenv.cars.profile import (
     SVEA,

@@ -45,7 +45,7 @@ def import_(
                 f"{'--out' if out else '--override'}: needs the map of the bags' topics, --map topics.toml"
             )
         from coopenv.base.files import check_file, check_new, replace_text
-        from coopenv.cars.bags import examined, proposed
+        from coopenv.cars.bags.bag import examined, proposed
         from coopenv.cars.bags.files import BagFile
 
         if propose is not None:
@@ -132,7 +132,7 @@ def calibrate(
     from coopenv.base.files import check_file, new_folder, replace_text
     from coopenv.cars.calibration import calibrate as calibrated
     from coopenv.cars.calibration import toml_text
-    from coopenv.cars.calibration.drives import drive_of_bag, drive_of_recording
+    from coopenv.cars.calibration_drives import drive_of_bag, drive_of_recording
     from coopenv.runs.console import Progress
     from coopenv.viz.error_figures import residual_figure
     from coopenv.viz.style import save
@@ -187,8 +187,8 @@ def identify(
     """
     from coopenv.backends.sources import open_bags
     from coopenv.base.files import check_file, replace_text
-    from coopenv.cars.calibration.identify import identify as identified
-    from coopenv.cars.calibration.identify import toml_text
+    from coopenv.cars.identify import identify as identified
+    from coopenv.cars.identify import toml_text
     from coopenv.runs.console import Progress, number_table
 
     check_file(out)

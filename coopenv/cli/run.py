@@ -312,7 +312,7 @@ def export(
 
 
 def _export_layout(log: Path, out: Path) -> None:
-    from coopenv.backends.mcap.format import topics_of
+    from coopenv.backends.mcap_format import topics_of
     from coopenv.base.errors import DataError
     from coopenv.base.files import replace_text
     from coopenv.viz.foxglove import layout_text

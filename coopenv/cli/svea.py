@@ -93,9 +93,9 @@ def fake(
     """Let a fake car drive, see and send until it is interrupted; a line marks when it is ready."""
     from coopenv.base import interrupts
     from coopenv.cars.deployment import load_deployment
-    from coopenv.cars.fake import fake_fault
     from coopenv.cars.fake.fleet import prepare_fake, run
-    from coopenv.cars.transport.zenoh import open_transport
+    from coopenv.cars.fake.settings import fake_fault
+    from coopenv.cars.zenoh import open_transport
 
     faults = [fake_fault(text) for text in fault or ()]
     make = prepare_fake(deployment, car, gate, station)
@@ -146,7 +146,7 @@ def gate(
     """
     from coopenv.base import interrupts
     from coopenv.cars.gate_process import CLOCK, gate_deployment, prepare_gate, run
-    from coopenv.cars.transport.zenoh import open_transport
+    from coopenv.cars.zenoh import open_transport
 
     bounds = {"speed": max_speed, "steering": max_steering, "acceleration": max_acceleration}
     fleet = gate_deployment(car, deployment, connect, off_board)
@@ -184,7 +184,7 @@ def health(
     from coopenv.cars.gate_process import gate_deployment
     from coopenv.cars.keys import load_verifier
     from coopenv.cars.transport import UNIX, LinkError
-    from coopenv.cars.transport.zenoh import open_transport
+    from coopenv.cars.zenoh import open_transport
 
     fleet = gate_deployment(car, deployment, connect, off_board)
     verifier = None if fleet.keys is None else load_verifier(fleet.keys)
@@ -255,8 +255,8 @@ def see(
     from coopenv.cars.profile import Role
     from coopenv.cars.readings import read
     from coopenv.cars.see import FrameReader
-    from coopenv.cars.transport.zenoh import open_transport
     from coopenv.cars.vision import Calibration, opencv
+    from coopenv.cars.zenoh import open_transport
 
     fleet = gate_deployment(car, deployment, connect, off_board)
     profile, topic = fleet.profile, fleet.profile.topic_of(car, Role.CAMERA_INFO)
@@ -322,7 +322,7 @@ def router(
 ) -> None:
     """Run a Zenoh router until it is interrupted; a line marks when it is ready."""
     from coopenv.base import interrupts
-    from coopenv.cars.transport.zenoh import open_zenoh
+    from coopenv.cars.zenoh import open_zenoh
 
     endpoints = listen or ([] if config else ["tcp/127.0.0.1:7447"])
     with closing(open_zenoh("router", listen=endpoints, config=config)):

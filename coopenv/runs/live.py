@@ -22,7 +22,7 @@ from coopenv.viz.scene import Frame, Origin, SceneRecord
 from coopenv.viz.stage import vehicle_mark
 from coopenv.viz.topview import PictureWindow, TopView
 from coopenv.viz.topview_ground import HEIGHT, WIDTH
-from coopenv.viz.web.panel import Abilities
+from coopenv.viz.web_panel import Abilities
 
 LEAVE, AGAIN = {"escape", "q"}, {"r"}
 HELP = "Arrow keys: faster, slower, left, right. r: again. Escape: leave."

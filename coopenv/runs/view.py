@@ -13,8 +13,8 @@ from coopenv.runs.scenes import MAX_FPS
 from coopenv.viz.scene import Frame
 from coopenv.viz.stage import Stage, entries
 from coopenv.viz.web import aim
-from coopenv.viz.web.panel import LONGEST, NO_FAULT, Panel
-from coopenv.viz.web.picture import Picture, first_look
+from coopenv.viz.web_panel import LONGEST, NO_FAULT, Panel
+from coopenv.viz.web_picture import Picture, first_look
 
 _NAP = 0.05  # s, longest sleep: wishes are not kept waiting longer
 _LAG = 0.5  # s that frames may be late before time is let go

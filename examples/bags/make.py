@@ -18,8 +18,8 @@ from coopenv.cars import codec
 from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
 from coopenv.cars.deployment import load_deployment
-from coopenv.cars.fake import fake_fault
 from coopenv.cars.fake.car import Fake
+from coopenv.cars.fake.settings import fake_fault
 from coopenv.cars.gate import GateClock, write_drive
 from coopenv.cars.profile import MotionCommand, Role
 from coopenv.cars.transport import Arrival, matcher

@@ -19,7 +19,7 @@ import coopenv
 from coopenv.api.arguments import Info
 from coopenv.base.errors import Explained
 from coopenv.base.files import replace_text
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.runs import record, rollout
 from coopenv.scenario import Scenario
 from tests.helpers.commands import refused

@@ -22,7 +22,7 @@ from coopenv.cars.backend.backend import open_svea
 from coopenv.cars.codec import decode
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport import Arrival
-from coopenv.cars.transport.zenoh import open_zenoh
+from coopenv.cars.zenoh import open_zenoh
 from tests.helpers.cars import LAB, LAB_CARS, OVERTAKING, PATIENT, cars, fakes, write_fleet
 from tests.helpers.processes import COOPENV, start
 from tests.helpers.wire import free_port

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from coopenv import DataError
-from coopenv.backends.mcap import container, read_recording, write_recording
+from coopenv.backends import mcap_container as container
+from coopenv.backends.mcap import read_recording, write_recording
 from coopenv.backends.worlds import Replay
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.mcap_edits import Sent, edit

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from coopenv import DataError
 from coopenv.backends.mcap import read_recording, write_recording
 from coopenv.backends.mrclam import load_dataset, recording_of
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Truth
 from tests.helpers import mrclam_files

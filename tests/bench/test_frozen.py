@@ -15,7 +15,7 @@ import pytest
 from benchmarks import freeze
 from coopenv.bench import frozen
 from coopenv.bench.frozen import Frozen, totals_of
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.policies.base import played_back
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.runs.recorder import record

@@ -23,7 +23,7 @@ from coopenv.bench.pages import (
     studied,
     value_of_sensing_text,
 )
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.viz.topview_ground import HEIGHT, WIDTH
 from tests.helpers.commands import refused

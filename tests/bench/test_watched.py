@@ -14,7 +14,7 @@ import pytest
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.executors import NOT_RUN, ProcessLimits, _work, find_executor
 from coopenv.bench.frozen import Frozen, report
-from coopenv.cli import main
+from coopenv.cli.app import main
 from tests.helpers.commands import refused
 from tests.helpers.processes import DEADLOCK
 

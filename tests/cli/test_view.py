@@ -15,7 +15,7 @@ from PIL import Image
 
 from coopenv.base.installation import data_directory
 from coopenv.cars.fake.fleet import fakes
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.cli.options import has_display
 from tests.helpers.commands import refused
 from tests.helpers.processes import COOPENV, start

@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
-from coopenv.cli import main
+from coopenv.cli.app import main
 
 
 def refused(*arguments: str, command: Callable[[Sequence[str]], int] = main) -> str:

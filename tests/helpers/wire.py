@@ -64,7 +64,7 @@ def listening(pid: int) -> list[str]:
 
 
 def _main(kind: str, endpoint: str) -> None:
-    from coopenv.cars.transport.zenoh import open_zenoh
+    from coopenv.cars.zenoh import open_zenoh
 
     if kind == "router":
         transport = open_zenoh("router", listen=[endpoint])

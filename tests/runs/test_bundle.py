@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coopenv.cli import main
+from coopenv.cli.app import main
 from tests.helpers.commands import refused
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"

@@ -19,7 +19,7 @@ from rich.console import Console
 import coopenv
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.installation import data_directory
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.estimation import compiled
 from coopenv.runs import console as module
 from coopenv.runs import scenario_text as words

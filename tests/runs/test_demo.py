@@ -27,8 +27,8 @@ from coopenv.cars.fake.car import fault_topic
 from coopenv.cars.fake.fleet import fakes as fake_processes
 from coopenv.cars.fake.fleet import free_port
 from coopenv.cars.profile import SVEA, USUAL, Role
-from coopenv.cars.transport.zenoh import open_zenoh
-from coopenv.cli import app
+from coopenv.cars.zenoh import open_zenoh
+from coopenv.cli.app import app
 from coopenv.cli.svea import STOPPED
 from coopenv.estimation.observability import Trajectory
 from coopenv.runs.command import execute, report

@@ -18,7 +18,7 @@ from PIL import Image
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError, OutputError
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.cli.options import console
 from coopenv.policies import load_agent
 from coopenv.policies.base import zero_policy

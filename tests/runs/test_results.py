@@ -14,7 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coopenv.base import files
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.estimation.metrics import absolute_error, relative_error
 from coopenv.estimation.observability import Trajectory
 from coopenv.runs.command import Results

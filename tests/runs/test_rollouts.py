@@ -16,7 +16,7 @@ import pytest
 import coopenv
 from coopenv.base.errors import CoopenvError, DeviceError
 from coopenv.base.format import json_text
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.estimation import Sight
 from coopenv.estimation.metrics import CONVERGED
 from coopenv.estimation.observability import Trajectory, analyse_observability

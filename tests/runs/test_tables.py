@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import coopenv
 from coopenv.base.columns import Columns
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.estimation.observability import Trajectory
 from coopenv.runs.command import Results
 from tests.helpers.four_way import FOUR_WAY

@@ -10,7 +10,7 @@ import pytest
 
 from coopenv.base.installation import list_agents, list_envs
 from coopenv.cars.deployment import Car, Deployment, GateLink, NetworkSettings, Remote, Safety, Security, Sensors
-from coopenv.cars.fake import FakeSettings
+from coopenv.cars.fake.settings import FakeSettings
 from coopenv.cars.profile import SVEA
 from coopenv.cars.transport import Tls
 from coopenv.observers import registry

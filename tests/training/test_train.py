@@ -22,7 +22,7 @@ pytest.importorskip("tensorboard", reason="needs the extra 'train'")
 
 import coopenv
 from coopenv.base.errors import CoopenvError
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.policies import find_agent, load_agent
 from coopenv.policies.loader import read_card
 from coopenv.training.command import train

@@ -25,8 +25,8 @@ from coopenv.viz.scene import Frame, Origin, SceneRecord
 from coopenv.viz.stage import Stage, entries
 from coopenv.viz.topview import TopView
 from coopenv.viz.web import write_replay
-from coopenv.viz.web.panel import GAIN, table_html
-from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, first_look, level_lines, levels, stopped
+from coopenv.viz.web_panel import GAIN, table_html
+from coopenv.viz.web_picture import FIELD_OF_VIEW, first_camera, first_look, level_lines, levels, stopped
 from tests.helpers.env_suite import ALIKE, each_slow
 
 ALONG = np.array([40.0, 0.0, 0.0])

@@ -15,7 +15,7 @@ import coopenv
 from coopenv.api.engine import Engine
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.terms.layout import observation_layout
-from coopenv.backends.mcap.recordings import read_recording, write_recording
+from coopenv.backends.mcap import read_recording, write_recording
 from coopenv.backends.worlds import Replay
 from coopenv.base.errors import ActionError, ScenarioError
 from coopenv.estimation import Sight

@@ -30,7 +30,7 @@ from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.keys import Signer, Verifier, load_keys
 from coopenv.cars.profile import RESET_TOPIC, VELOCITY, Role, presence_of
 from coopenv.cars.transport import Transport
-from coopenv.cars.transport.zenoh import open_transport
+from coopenv.cars.zenoh import open_transport
 from coopenv.estimation.poses import left_covariance
 from coopenv.observers.recording import Sensed
 from coopenv.scenario import Scenario, load_scenario

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
-from coopenv.backends.mcap.format import CUT_OFF, RosLog, codec, metadata_names, reading
+from coopenv.backends.mcap_format import CUT_OFF, RosLog, codec, metadata_names, reading
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, OutputError
 from coopenv.base.files import writing
 from coopenv.base.installation import install_command, version
@@ -178,7 +178,7 @@ class Drive(TickGenerator):
             CoopenvError: an override is not valid, or the extra is missing.
         """
         codec()  # whose error names the missing extra
-        from coopenv.backends.mcap.container import Container
+        from coopenv.backends.mcap_container import Container
 
         self._where = str(path)
         with reading(self._where):

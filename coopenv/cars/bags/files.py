@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.backends.mcap.format import REPAIR
+from coopenv.backends.mcap_format import REPAIR
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, error_text
 from coopenv.base.installation import install_command
 from coopenv.cars import codec
@@ -91,7 +91,7 @@ class BagFile:
         """Return a copy of a packed file that is unpacked, until the bag is closed. Raises TooLargeError."""
         import zstandard
 
-        from coopenv.backends.mcap.container import Allowance
+        from coopenv.backends.mcap_container import Allowance
 
         place = Path(self._stack.enter_context(tempfile.TemporaryDirectory()), file.name.removesuffix(PACKED))
         allowance = Allowance(file.stat().st_size)
@@ -158,7 +158,7 @@ class BagFile:
             raise CoopenvError(f"{kind}: cannot be read ({type(error).__name__})") from None
 
     def _unreadable(self, error: Exception) -> DataError:
-        from coopenv.backends.mcap.container import TooLargeError
+        from coopenv.backends.mcap_container import TooLargeError
 
         if isinstance(error, TooLargeError):
             return DataError(f"{self.path}: {error}")

@@ -16,9 +16,9 @@ from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionF
 from rosbags.rosbag1.reader import Header, RecordType, normalize, read_uint32
 from rosbags.typesys.msg import normalize_msgtype
 
-from coopenv.backends.mcap import container
-from coopenv.backends.mcap.container import Allowance, TooLargeError, messages_of, records_of
-from coopenv.backends.mcap.format import MAGIC, is_cut_off
+from coopenv.backends import mcap_container as container
+from coopenv.backends.mcap_container import Allowance, TooLargeError, messages_of, records_of
+from coopenv.backends.mcap_format import MAGIC, is_cut_off
 
 FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
 ENDS_EARLY = "its end is missing"

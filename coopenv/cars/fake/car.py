@@ -15,8 +15,8 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode, pose, stamp_of, warm_up
-from coopenv.cars.fake import USUAL, CarFaults, FakeSettings, Wire, end_process, fake_fault, fault_topic
 from coopenv.cars.fake.sensors import LEADER_RATE, TRUTH_RATE, Act, CarSensors, FakeCamera, SensorPublisher
+from coopenv.cars.fake.settings import USUAL, CarFaults, FakeSettings, Wire, end_process, fake_fault, fault_topic
 from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
 from coopenv.cars.gate import PERIOD, GateClock, Malformed, read_drive, write_drive
 from coopenv.cars.gate_process import CLOCK, GateConnection

@@ -15,7 +15,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import encode, header, make, ros2
-from coopenv.cars.fake import AHEAD, CarFaults, FakeSettings
+from coopenv.cars.fake.settings import AHEAD, CarFaults, FakeSettings
 from coopenv.cars.fake.world import CarWorld, Neighbours
 from coopenv.cars.profile import IMAGES, CarProfile, Role
 from coopenv.cars.see import object_bearings

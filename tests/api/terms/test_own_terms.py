@@ -15,7 +15,7 @@ import coopenv
 from coopenv.api.terms.records import Ego, FleetRecord, Target, TruthRecord
 from coopenv.base.errors import CoopenvError, ScenarioError
 from coopenv.base.installation import scenario_path
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.estimation import Outcome
 from coopenv.estimation.observability import Trajectory
 from coopenv.scenario.terms import REWARD_TERMS

@@ -15,7 +15,7 @@ from PIL import Image
 import coopenv
 from coopenv.base.installation import data_directory
 from coopenv.bench.cards import shown, stress
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.evaluation import METRICS
 from coopenv.scenario import load_scenario
 from tests.helpers.commands import refused

@@ -23,7 +23,7 @@ from coopenv.bench.observers.figures import PLOTLY, chart_data, page_file
 from coopenv.bench.observers.judge import Series
 from coopenv.bench.observers.rows import Row
 from coopenv.bench.observers.tables import headline, quality
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.observers import registry
 from tests.bench.observers.test_comparison import SOURCE
 from tests.helpers import mrclam_files

@@ -25,7 +25,7 @@ from coopenv.bench.observers.convergence import (
     study_basin,
     study_seeds,
 )
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.observers import Estimate, Recording, Tick, find, run
 from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.runs import rollout

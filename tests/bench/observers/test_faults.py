@@ -16,13 +16,13 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 import coopenv
-from coopenv.backends.mcap.recordings import write_recording
+from coopenv.backends.mcap import write_recording
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers.changes import DIRECTION, usual_sender
 from coopenv.bench.observers.command import figure_files
 from coopenv.bench.observers.faults import FAULTS, VARIANTS, variant_of
 from coopenv.bench.observers.sources import SimulatedRecords, find_source, variants_of
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.cli.bench import ObserverOptions
 from coopenv.observers import Message, Recording
 from coopenv.observers.mailbox import Interference, altered

@@ -20,7 +20,7 @@ from coopenv.bench.observers import compare, judge
 from coopenv.bench.observers.judge import LEVEL_BINS, TimeWindow, level_measures, windows_of
 from coopenv.bench.observers.rows import EDGES, UNKNOWN, WindowRow, checked_edges, mean_root, ratio, spread
 from coopenv.bench.observers.tables import level_figures
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao, cramer_rao_ancestors
 from coopenv.observers.runner import Run

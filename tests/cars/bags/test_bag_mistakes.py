@@ -18,17 +18,18 @@ import pytest
 from numpy.testing import assert_allclose
 
 from coopenv import CoopenvError, DataError
-from coopenv.backends.mcap import container
-from coopenv.backends.mcap.format import metadata_names
+from coopenv.backends import mcap_container as container
+from coopenv.backends.mcap_format import metadata_names
 from coopenv.backends.sources import SourceKind, is_bag, kind_of
 from coopenv.base.errors import DataWarning
 from coopenv.cars import codec
-from coopenv.cars.bags import Bag, files
+from coopenv.cars.bags import files
+from coopenv.cars.bags.bag import Bag
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TopicMapError, load_map
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import Detections, Twist
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.scenario import load_scenario
 from tests.helpers import bags
 from tests.helpers.bags import MAP

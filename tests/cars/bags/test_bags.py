@@ -21,9 +21,9 @@ from coopenv.base.errors import DataWarning
 from coopenv.bench.observers import sources
 from coopenv.cars import codec
 from coopenv.cars.backend.drive import DriveRecorder
-from coopenv.cars.bags import Bag
+from coopenv.cars.bags.bag import Bag
 from coopenv.cars.bags.log import Shift, reconcile, recorders, regularity
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Sensed
 from coopenv.runs.recorder import record

@@ -14,9 +14,9 @@ import pytest
 from coopenv.base.errors import DataError
 from coopenv.cars.bags.topic_map import Correction
 from coopenv.cars.calibration import Calibrated, calibrate, toml_text
-from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive
+from coopenv.cars.calibration_drives import CalibrationDrive, CarDrive
 from coopenv.cars.vision import Calibration, rays
-from coopenv.cli import main
+from coopenv.cli.app import main
 from coopenv.scenario import load_scenario
 from tests.helpers.commands import refused
 from tests.helpers.env_suite import rest_slow

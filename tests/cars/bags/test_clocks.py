@@ -15,7 +15,7 @@ from numpy.testing import assert_array_equal
 
 from coopenv import DataError
 from coopenv.base.errors import DataWarning
-from coopenv.cars.bags import Bag
+from coopenv.cars.bags.bag import Bag
 from coopenv.cars.bags.clocks import SampledSignal, delay_of, jumps, lead_of_bearings, lead_of_motion, outlying, turn_of
 from coopenv.observers import Recording, run
 from coopenv.runs.recorder import record

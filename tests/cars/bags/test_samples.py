@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from coopenv.cars.bags import Bag, cars_of, examined, proposed, role_of
+from coopenv.cars.bags.bag import Bag, cars_of, examined, proposed, role_of
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.log import TopicRow
 from coopenv.cars.bags.topic_map import load_map
 from coopenv.cars.profile import Role
-from coopenv.cli import main
+from coopenv.cli.app import main
 from tests.helpers.commands import refused
 
 pytest.importorskip("rosbags", reason="needs the extra 'log'")

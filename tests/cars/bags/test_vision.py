@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coopenv import CoopenvError
-from coopenv.cars.bags import Bag, examined, proposed
+from coopenv.cars.bags.bag import Bag, examined, proposed
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.codec import make
 from coopenv.cars.fake.sensors import FrameRenderer, PlacedTag

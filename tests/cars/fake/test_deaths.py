@@ -17,7 +17,7 @@ import coopenv
 from coopenv.cars.codec import decode
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport import Arrival
-from coopenv.cars.transport.zenoh import open_zenoh
+from coopenv.cars.zenoh import open_zenoh
 from tests.helpers.cars import OVERTAKING
 from tests.helpers.processes import COOPENV, started, wait_until
 from tests.helpers.wire import free_endpoint

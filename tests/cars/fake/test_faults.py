@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from coopenv.base.fault_text import FaultError
 from coopenv.cars.codec import stamp_of
-from coopenv.cars.fake import FAKE_FAULTS, CarFaults, car, fake_fault, fault_topic
+from coopenv.cars.fake import car
+from coopenv.cars.fake.settings import FAKE_FAULTS, CarFaults, fake_fault, fault_topic
 from coopenv.cars.profile import SVEA, Role
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 

@@ -30,8 +30,8 @@ from coopenv.cars.gate import write_status
 from coopenv.cars.keys import load_signer, load_verifier, make_keys
 from coopenv.cars.profile import SVEA, Limits, Role, presence_of
 from coopenv.cars.transport import Arrival
-from coopenv.cars.transport.zenoh import open_zenoh
-from coopenv.cli import app
+from coopenv.cars.zenoh import open_zenoh
+from coopenv.cli.app import app
 from coopenv.cli.svea import next_message
 from tests.helpers.cars import OVERTAKING, fakes, open_fake, write_fleet
 from tests.helpers.hub import Hub

@@ -20,14 +20,14 @@ from coopenv.cars.backend.assembler import Intake
 from coopenv.cars.backend.binding import bind
 from coopenv.cars.codec import decode, encode, header, make, stamp_of
 from coopenv.cars.deployment import DeploymentError, Sensors, load_deployment
-from coopenv.cars.fake import FakeSettings
 from coopenv.cars.fake.fleet import fakes
+from coopenv.cars.fake.settings import FakeSettings
 from coopenv.cars.profile import SVEA, CarProfile, Role, load_profile
 from coopenv.cars.readings import read
 from coopenv.cars.see import FrameReader
 from coopenv.cars.transport import Arrival
-from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cars.vision import Calibration
+from coopenv.cars.zenoh import open_zenoh
 from tests.helpers.cars import PATIENT
 from tests.helpers.fakes import CAMERA, EXACT, MARKER, MARKERS, OVERTAKING, Stage
 from tests.helpers.frames import BEARINGS, FLEET, FRAMES, grey_frame, seeing

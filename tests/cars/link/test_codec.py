@@ -16,8 +16,8 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import MOST_BYTES, cdr_of, decode, encode, header, make, ros1, ros1_of, ros2, stamp_of
 from coopenv.cars.gate import read_drive, write_drive
 from coopenv.cars.profile import NEUTRAL, SVEA, Limits, MotionCommand, Role, presence_of
+from coopenv.cars.ros1 import low_level
 from coopenv.cars.transport import matcher
-from coopenv.cars.transport.ros1 import low_level
 
 ENCAPSULATION = bytes.fromhex("00010000")
 MANUAL = "mavros_msgs/msg/ManualControl"

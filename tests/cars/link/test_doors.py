@@ -21,7 +21,7 @@ from coopenv.cars.gate import write_drive
 from coopenv.cars.keys import load_signer, make_keys
 from coopenv.cars.profile import SVEA, USUAL, MotionCommand, Role
 from coopenv.cars.transport import Tls
-from coopenv.cars.transport.zenoh import Zenoh, open_zenoh
+from coopenv.cars.zenoh import Zenoh, open_zenoh
 from tests.cars.link.gate.bench import CAR
 from tests.cars.link.gate.station import Station, running_gate
 from tests.helpers.brokers import Authority

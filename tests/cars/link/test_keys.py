@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.base.errors import CoopenvError
+from coopenv.cars import zenoh
 from coopenv.cars.keys import (
     DOMAIN,
     PUBLIC,
@@ -25,8 +26,7 @@ from coopenv.cars.keys import (
     load_verifier,
     make_keys,
 )
-from coopenv.cars.transport import zenoh
-from coopenv.cli import main
+from coopenv.cli.app import main
 from tests.helpers.processes import ROOT
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="modes of files")

@@ -19,8 +19,8 @@ import pytest
 
 from coopenv.cars.keys import load_signer, load_verifier, make_keys
 from coopenv.cars.profile import NEUTRAL, Role
-from coopenv.cars.transport.zenoh import LEASE, open_zenoh
-from coopenv.cli import main
+from coopenv.cars.zenoh import LEASE, open_zenoh
+from coopenv.cli.app import main
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR, messages_of_strangers
 from tests.cars.link.gate.station import Station, running_gate
@@ -242,7 +242,7 @@ def test_it_loads_neither_the_simulation_nor_numpy() -> None:
     code = (
         "import sys; sys.argv[0] = 'coopenv'\n"  # the package does not register environments for its own command
         "import coopenv.cars.gate, coopenv.cars.gate_process, coopenv.cars.keys\n"
-        "import coopenv.cars.deployment, coopenv.cars.transport.zenoh\n"
+        "import coopenv.cars.deployment, coopenv.cars.zenoh\n"
         "print(*sys.modules)"
     )
     result = subprocess.run(
@@ -261,7 +261,7 @@ def test_a_car_needs_only_the_packages_of_its_group(command: str) -> None:
     absent = sorted({re.split("[<>]", each)[0].removesuffix("-lang") for each in {*needed} - {*small}})
     assert "scipy" in absent and "warp" in absent
     code = f"import sys; sys.argv[0] = 'coopenv'; sys.modules |= dict.fromkeys({absent})"
-    code += "; from coopenv.cli import main; sys.exit(main(sys.argv[1:]))"
+    code += "; from coopenv.cli.app import main; sys.exit(main(sys.argv[1:]))"
     words = [
         "svea",
         command,

@@ -15,7 +15,7 @@ from matplotlib.colors import to_rgba
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.mcap.format import LogClock, View, codec, ros_definition
+from coopenv.backends.mcap_format import LogClock, View, codec, ros_definition
 from coopenv.base.format import jsonable
 from coopenv.estimation.poses import Array, covariance_in_map
 from coopenv.observers import Run

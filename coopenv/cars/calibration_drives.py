@@ -19,7 +19,7 @@ from coopenv.estimation.poses import Array, log_so3
 from coopenv.scenario import Scenario
 
 if TYPE_CHECKING:
-    from coopenv.cars.bags import Bag
+    from coopenv.cars.bags.bag import Bag
     from coopenv.observers.recording import Recording
 
 NS = 1e-9

@@ -189,14 +189,14 @@ def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:
     network, certificates = deployment.network, certificates_of(deployment)
     if network.kind == "zenoh":
         return open_zenoh("client", network.connect, tls=certificates, timeout=timeout)
-    from coopenv.cars.transport.ros1 import Authors, routes_of
+    from coopenv.cars.ros1 import Authors, routes_of
 
     routes = [route for car in deployment.cars for route in routes_of(car, deployment.profile)]  # before any is opened
     if network.kind == "nats":
-        from coopenv.cars.transport.nats import open_nats
+        from coopenv.cars.nats import open_nats
 
         return Authors(open_nats(network.connect, certificates, timeout), routes)
-    from coopenv.cars.transport.ros1 import open_ros1
+    from coopenv.cars.ros1 import open_ros1
 
     types = {route.name: route.theirs for route in routes}
     return Authors(open_ros1(network.connect[0], types, timeout), routes)

@@ -15,7 +15,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 
-from coopenv.backends.mcap.format import CUT_OFF, MAGIC, MENDED, is_cut_off
+from coopenv.backends.mcap_format import CUT_OFF, MAGIC, MENDED, is_cut_off
 from coopenv.base.errors import DataError, check_memory, shown
 
 AT_ONCE = 32 * 2**20

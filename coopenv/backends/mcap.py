@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.mcap.format import (
+from coopenv.backends.mcap_format import (
     ATTACHMENT,
     CONTENTS,
     FORMAT,
@@ -37,7 +37,7 @@ from coopenv.observers.contract import Setup
 from coopenv.observers.recording import ARRAYS, Recording, Truth, check_recording, sizes_of
 
 if TYPE_CHECKING:
-    from coopenv.backends.mcap.container import Container
+    from coopenv.backends.mcap_container import Container
 
 
 class TickArrays:
@@ -120,7 +120,7 @@ def read_recording(path: str | Path) -> Recording:
             itself.
     """
     codec()
-    from coopenv.backends.mcap.container import Container
+    from coopenv.backends.mcap_container import Container
 
     where = str(path)
     with reading(where):

@@ -28,8 +28,8 @@ from coopenv.viz.meshes import Look
 from coopenv.viz.scene import SceneRecord
 from coopenv.viz.stage import Stage
 from coopenv.viz.style import thinned
-from coopenv.viz.web.panel import legend_html
-from coopenv.viz.web.picture import FIELD_OF_VIEW, Picture, first_camera, first_look
+from coopenv.viz.web_panel import legend_html
+from coopenv.viz.web_picture import FIELD_OF_VIEW, Picture, first_camera, first_look
 
 TOKEN_BYTES = 12
 """Random bytes of a page's address."""
