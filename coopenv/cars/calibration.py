@@ -86,7 +86,8 @@ def parts_of(batch: Batch) -> dict[str, list[int]]:
     """Return the constants that one finding names together, by its title."""
     found: dict[str, list[int]] = {}
     for n, kind in enumerate(batch.kinds):
-        found.setdefault(kind.part, []).append(n)
+        if kind.prior:  # coefficients that the model of the lens does not have are without
+            found.setdefault(kind.part, []).append(n)
     return found
 
 
@@ -95,7 +96,7 @@ def hypotheses(batch: Batch) -> list[NDArray[np.int64]]:
     parts = parts_of(batch)
     groups = [*parts.values()]
     for c, car in enumerate(batch.cars):
-        groups += [[n for title in titles for n in parts[f"{car.name}: {title}"]] for titles in TOGETHER]
+        groups += [[n for title in titles for n in parts.get(f"{car.name}: {title}", ())] for titles in TOGETHER]
         groups.append([batch.own(c).start + n for n in (CAMERA_TIME, TRUTH_TIME)])
     groups += [[n] for n, kind in enumerate(batch.kinds[: batch.markers]) if kind.unit in ("deg", "m", "s")]
     return [np.array(group) for group in groups if batch.known[group].all()]

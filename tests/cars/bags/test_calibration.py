@@ -145,7 +145,7 @@ ROWS = [
 """Constants, what is named, what is found, and whether there is motion capture."""
 
 
-@pytest.mark.parametrize(("given", "named", "true", "truth"), rest_slow(ROWS, 2, 8))
+@pytest.mark.parametrize(("given", "named", "true", "truth"), rest_slow(ROWS, 2, 7, 8))
 def test_wrong_constants_are_named_and_recovered(
     given: dict[str, Any], named: set[str], true: dict[str, float], truth: bool
 ) -> None:
