@@ -37,9 +37,8 @@ FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
         ("targets_in_view", "vehicle", 1, "targets", "targets", 0, "number of targets measured in this frame"),
     ],
     "bearings": [
-        # The frames of `bearings` and `sighting` differ, and stay so: networks of saved agents were trained with them.
-        ("bearings", "target", 3, "1", 1, -1,
-         "unit vector camera to target, optical frame (x right, y down; `sighting`: body frame); 0: never seen"),
+        ("bearing", "target", 3, "1", 1, -1,
+         "unit vector camera to target, body frame; 0: never seen"),
         ("bearing_mask", "target", 1, "bool", 1, 0, "1: measured in this frame"),
         ("bearing_age", "target", 1, "s", "age_scale", 0,
          "time since measured; 1: longer ago than the scale, or never"),
@@ -91,7 +90,7 @@ FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
     ],
     "sightings": [
         ("sighting", "neighbour", 3, "1", 1, -1,
-         "unit vector camera to neighbour, body frame (x ahead, y left; `bearings`: optical frame); 0: never seen", XY),
+         "unit vector camera to neighbour, body frame; 0: never seen", XY),
         ("sighting_mask", "neighbour", 1, "bool", 1, 0, "1: measured in this frame"),
         ("sighting_age", "neighbour", 1, "s", "age_scale", 0, "time since it was measured"),
     ],

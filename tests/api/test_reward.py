@@ -174,11 +174,7 @@ EXCEPTIONS = {
         "message_forward": "and goes the same way as the car",
     },
     "facade": {"map_in_view": "the nearest landmark stands beside the car, out of its camera's view"},
-    "large_crossing": {
-        "map_in_view": "the nearest landmarks stand beside the car, out of its camera's view",
-        "message_clearance": "whom the last slots are of, who goes before it in the order, seldom comes near",
-        "message_forward": "only the last car hears the last but one, which drives at a right angle to it",
-    },
+    "large_crossing": {"map_in_view": "the nearest landmarks stand beside the car, out of its camera's view"},
     "urban_crossing": {"map_in_view": "the nearest landmarks stand beside the car, out of its camera's view"},
 }
 """Fields with an entry that hardly varies, and why it is there."""

@@ -238,7 +238,7 @@ def target_record(model: Any, state: Any, world: int, vehicle: int, n: int) -> T
         target.age = wp.float32(NEVER)
     else:
         target.index = agent_of(state, model.kept, world, vehicle, entry)
-        target.bearing = wp.vec3(state.bearing[world, vehicle, entry])
+        target.bearing = wp.vec3(body_bearing(model, state, world, vehicle, entry))
         target.in_view = state.sight[world, vehicle, entry] == VISIBLE
         target.age = seconds_since(state.tick[world], state.bearing_tick[world, vehicle, entry], model.camera_rate)
     return target

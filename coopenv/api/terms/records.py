@@ -104,7 +104,7 @@ class Target:
     """A landmark or another vehicle as measured by the camera."""
 
     index: wp.int32  # landmarks first, then vehicles
-    bearing: wp.vec3  # unit vector camera to target, optical frame, last measured; 0: never
+    bearing: wp.vec3  # unit vector camera to target, body, last measured; 0: never
     in_view: wp.bool  # measured in this frame
     age: wp.float32  # s since measured
 
@@ -236,7 +236,7 @@ def target_values(target: Target) -> TargetValues:
     """Return the values of the fields with one value per landmark and vehicle."""
     bearing = target.bearing
     return TargetValues(
-        bearing[0], bearing[1], bearing[2],  # bearings
+        bearing[0], bearing[1], bearing[2],
         wp.float32(target.in_view),  # bearing_mask
         target.age,  # bearing_age
     )  # fmt: skip
