@@ -1,4 +1,4 @@
-"""What users give and read on the host: options of a reset, results of a step, state for critics, reward in Python."""
+"""Arguments and results on the host: options of a reset, results of a step, state for critics, reward in Python."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NotRequired, TypedDict
@@ -123,7 +123,7 @@ class Info(TypedDict):
     """Entries of `infos[agent]`, always the same ones."""
 
     truth: dict[str, np.ndarray]
-    """As of `Step`; with lasting errors of sensors, and faults, these too."""
+    """Fields of `Step`, and lasting errors of sensors and faults where the scenario has them."""
     estimate: EstimateInfo
     visible: tuple[str, ...]
     """Names of the targets measured in the last frame."""
@@ -212,7 +212,7 @@ class Step:
 STATE_LIMIT = 10.0
 """Largest entry of a state; most are below 1."""
 LASTING_SCALE = 0.1
-"""What lasting errors of sensors are divided by in a state; rad, rad/s, m, or a share."""
+"""Divisor of lasting sensor errors in a state; rad, rad/s, m, or a share."""
 
 
 def world_states(view: Callable[[str], np.ndarray], scenario: Scenario) -> np.ndarray:

@@ -104,7 +104,7 @@ class Engine:
         self.scripted: Any = scripted(scenario) if any(scenario.drivers) and not recorded else None
         """Drivers in place of actions; None without any, and of a record, which must name no code."""
         self.begun = False
-        """Whether every world has been reset, or restored from one that had."""
+        """True after every world has been reset, or restored from a state that followed a reset."""
 
     def reset(
         self,
@@ -266,7 +266,7 @@ class Engine:
 
     @cached_property
     def top_view(self) -> TopView:
-        """What draws pictures; matplotlib is loaded with the first one."""
+        """The renderer of the top view; matplotlib is loaded with the first picture."""
         from coopenv.viz.topview import TopView
 
         return TopView(self.backend.scenario)
@@ -318,14 +318,14 @@ RENDER_HINT = "; render_mode is given where the environment is made"
 
 
 class Saved(Explained):
-    """What the environments of an engine share: its layout, and states that are saved and restored."""
+    """Base class of the environments of an engine: its layout, and states that are saved and restored."""
 
     engine: Engine
     scenario: Scenario
     metadata: dict[str, Any]
     close: Any
     _arguments: dict[str, Any]
-    """Those that build an equal environment."""
+    """Arguments that build an equal environment."""
 
     @property
     def observation_layout(self) -> Layout:

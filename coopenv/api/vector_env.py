@@ -99,7 +99,7 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.single_action_space = action_space(self.scenario)
         self._on_cpu = self.engine.world.device == "cpu"
         self.arrays: ArrayKind = arrays if arrays is not None else ("numpy" if self._on_cpu else "torch")
-        """What arrays are: fresh host arrays, or tensors on the device that share memory with the engine."""
+        """Kind of arrays: fresh host arrays, or tensors on the device that share memory with the engine."""
         check_one_of("unknown arrays", self.arrays, ("numpy", "torch"))
         if self.arrays == "torch" and find_spec("torch") is None:
             raise CoopenvError(f"arrays='torch' needs torch: {install_command('train')}")

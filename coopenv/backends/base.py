@@ -1,4 +1,4 @@
-"""What a source of ticks is: the contract of every backend, simulated, recorded or on real vehicles.
+"""The contract of every backend, a source of ticks: simulated, recorded or on real vehicles.
 
 Time goes in ticks, the frames of the scenario's camera rate; between two decisions there are
 `scenario.ticks_per_decision` of them. A backend gives every tick, index after index: where nothing came in time from a
@@ -56,7 +56,7 @@ EPISODE_OVER = "the episode is over"
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What a backend can do."""
+    """Capabilities of a backend."""
 
     truth: bool  # poses are known; where not, errors are NaN and privileged rewards 0
     driven: bool  # commands have an effect
@@ -81,7 +81,7 @@ class VehicleBroadcast:
 
 @dataclass
 class Health:
-    """What has come since the backend was built; `late`, `missing` and `empty` count vehicles' rows."""
+    """Counts of ticks, rows and messages; `late`, `missing` and `empty` count vehicles' rows."""
 
     ticks: int = 0  # that were given
     late: int = 0  # rows that came after their deadline
@@ -106,9 +106,9 @@ class Backend(Protocol):
     scenario: Scenario
     """Vehicles, sensors, radio and observers."""
     capabilities: Capabilities
-    """What it can do; fixed once it is built."""
+    """Capabilities of the backend, fixed once it is built."""
     health: Health
-    """What has come since it was built."""
+    """Counts since it was built."""
 
     @property
     def clock(self) -> float:
@@ -171,7 +171,7 @@ Episode = Generator[Sensed, Command, None]
 
 
 IGNORED_OPTIONS = ("options", "arm")
-"""What PettingZoo's own tests of conformance pass to every environment, and what lets cars drive: simulated ones do."""
+"""Reset options ignored in simulation: `options` of PettingZoo's conformance tests, and `arm`, which arms cars."""
 
 
 def check_options(options: Iterable[str], known: Sequence[str]) -> None:

@@ -25,7 +25,7 @@ from coopenv.world.state import allocate, fields
 
 @dataclass(frozen=True)
 class Poses:
-    """Where N vehicles and Z other bodies, up to `most_vehicles`, are on the plane, map frame; all of it finite."""
+    """Planar poses of N vehicles and Z other bodies, up to `most_vehicles`, map frame; all finite."""
 
     xy: Array  # (N, 2) m
     heading: Array  # (N,) rad, from x towards y
@@ -67,7 +67,7 @@ class TrafficProgram(ABC):
 
     @property
     def roads(self) -> tuple[Road, ...]:
-        """What is drawn where the scenario has no roads."""
+        """Roads to draw if the scenario has none."""
         return ()
 
     @abstractmethod

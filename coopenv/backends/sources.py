@@ -35,7 +35,7 @@ IMPORT = "coopenv import {} --map topics.toml --out FILE.mcap"
 
 
 class SourceKind(Enum):
-    """What a name stands for."""
+    """Kind of source that a name denotes."""
 
     ENVIRONMENT = "an environment by name or TOML file"
     LOG = "an MCAP file"

@@ -17,7 +17,7 @@ NAN = float("nan")
 
 
 class SumoTraffic:
-    """One simulation, and which of its vehicles are those of a scenario."""
+    """One simulation, and the vehicles of a scenario in it."""
 
     def __init__(self) -> None:
         import libsumo

@@ -38,7 +38,7 @@ def open_world(backend: Backend, worlds: int, dtype: str, device: str, threads: 
 
 
 class TickWorld(SensingWorld):
-    """One world that is filled with what a backend gives.
+    """One world filled with the ticks of a backend.
 
     A missing vehicle continues with its last odometry and sees nothing. Unknown truth is NaN. The episode ends with the
     last tick of the backend.

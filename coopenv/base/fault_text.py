@@ -28,7 +28,7 @@ class FaultError(CoopenvError):
 
 @dataclass(frozen=True)
 class FaultKind:
-    """What a fault does, and what may stand in its text."""
+    """Effect of a fault, and the grammar of its text."""
 
     value: str
     """Placeholder of the value in capitals; empty: the fault has no value."""
@@ -40,19 +40,19 @@ class FaultKind:
     words: Mapping[str, float] = field(default_factory=dict)
     """Words before the value, `WORD[:VALUE]`, each with its default; empty: the value is a number."""
     free_word: bool = False
-    """Whether any word may stand before the value, `[WORD:]VALUE`."""
+    """Allow any word before the value, `[WORD:]VALUE`."""
     start: bool = False
-    """Whether `@START` is allowed."""
+    """Allow `@START`."""
     duration: bool = False
     options: Mapping[str, Bounds] = field(default_factory=dict)
     unused: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # options that a word does not have
     vehicles: bool = False
-    """Whether the fault is of single vehicles."""
+    """True if the fault belongs to single vehicles."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault as it is written."""
+    """One fault as written in text."""
 
     text: str
     name: str

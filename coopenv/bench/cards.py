@@ -180,7 +180,7 @@ class Contest:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation(Contest, Tabular):
-    """What drivers did, and their figures, by their names; printed, it is its tables.
+    """Episodes and figures of drivers, by name; printed, it is its tables.
 
     As a table it has a row per driver and metric: `to_pandas`, `to_polars`, `to_xarray`, `to_csv` and `to_parquet`.
     """
@@ -302,7 +302,7 @@ EXPLANATIONS = {
     "few": "share of that time with fewer than three targets in view",
     "return": "sum of the rewards of a vehicle",
 }
-"""What the words of the tables mean."""
+"""Legend of the tables."""
 
 
 def figures(results: Sequence[Result]) -> dict[str, dict[str, float]]:

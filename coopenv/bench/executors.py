@@ -1,4 +1,4 @@
-"""Where the work is done: in processes of this machine, or on an existing Ray cluster.
+"""Executors of tasks: processes of this machine, or an existing Ray cluster.
 
 An executor maps one function over tasks. What comes out depends on neither the executor nor its number of workers.
 Tasks in parts are ended one by one when they use more time or memory than they may. The parent measures: a limit of the
@@ -44,7 +44,7 @@ NOT_RUN = "; its remaining records were not run"
 
 @dataclass(frozen=True)
 class ProcessLimits:
-    """What an observer may use on one record."""
+    """Time and memory limits of an observer on one record."""
 
     seconds: float = 1800.0
     """Of processor time."""

@@ -66,7 +66,7 @@ class Frozen:
 
     @cached_property
     def definition(self) -> dict[str, Any]:
-        """What is measured."""
+        """Definition of the benchmark's measurement."""
         return tomllib.loads(self._text)
 
     @cached_property

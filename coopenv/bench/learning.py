@@ -54,7 +54,7 @@ def place_of(plan: TrainingPlan) -> Path:
 
 @dataclass(frozen=True)
 class Study:
-    """What is to be trained."""
+    """Trainings of a study."""
 
     plans: tuple[TrainingPlan, ...]
     """All trainings; every agent's first one before any agent's second."""
@@ -153,15 +153,15 @@ REPORTED, CHOSEN = 0, 1
 
 
 class Driven(NamedTuple):
-    """What episodes depend on."""
+    """Inputs that determine the episodes."""
 
     environment: str
     agent: str
     overrides: str
-    """As JSON."""
+    """Overrides as JSON."""
     block: int
     weights: tuple[int, ...]
-    """When they were written: weights that are trained anew are another agent."""
+    """Modification times of the weights: retrained weights are another agent."""
 
 
 class Judge:

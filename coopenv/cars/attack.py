@@ -254,7 +254,7 @@ class Intruder:
 
 @dataclass
 class AttackOutcome:
-    """What the messages of a kind did."""
+    """Effect of the messages of a kind."""
 
     what: str
     sent: int = 0
@@ -267,7 +267,7 @@ class AttackOutcome:
 
     @property
     def harmful(self) -> bool:
-        """Whether a car moved, or could have."""
+        """True if a car moved, or could have moved."""
         return self.through > 0 or self.speed > MOVES
 
 

@@ -1,4 +1,4 @@
-"""What a calibration reads of a drive: image points, odometry and motion capture of each car, from bags and logs."""
+"""Input of a calibration from a drive: image points, odometry and motion capture of each car, from bags and logs."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ ROLES = (
 
 @dataclass(frozen=True, kw_only=True)
 class CarDrive:
-    """What one car measured; times in s on one clock, planar vectors as complex numbers x + iy."""
+    """Measurements of one car; times in s on one clock, planar vectors as complex numbers x + iy."""
 
     name: str
     vehicle: int
@@ -65,7 +65,7 @@ class CarDrive:
 
 @dataclass(frozen=True)
 class CalibrationDrive:
-    """What a calibration reads."""
+    """Input of a calibration."""
 
     cars: tuple[CarDrive, ...]
     landmarks: tuple[str, ...]  # (L,) names of the static ones

@@ -46,7 +46,7 @@ def refuse_foreign(kind: str, endpoints: tuple[str, ...], field: str) -> None:
 
 
 class NetworkSettings(Section):
-    """How the cars are reached."""
+    """Settings of the cars' network."""
 
     kind: Literal["zenoh", "nats", "ros1"] = "zenoh"
     """`zenoh`: CDR under the keys of zenoh-bridge-ros2dds; `nats`: the authors' format; `ros1`: topics of a ROS
@@ -73,7 +73,7 @@ class NetworkSettings(Section):
 
 
 class GateLink(Section):
-    """Where the gate of a car connects to, whatever `network` says: no radio may stand between it and the wheels."""
+    """Connection of a car's gate, independent of `network`: no radio may be between the gate and the wheels."""
 
     connect: tuple[Endpoint, ...] | None = Field(default=None, min_length=1)
     """Endpoint, on the car, of its own bridge, router or ROS master for its gate and `coopenv svea health` (default: on
@@ -185,7 +185,7 @@ def refuse_repeated(cars: Sequence[Car], markers: Mapping[str, int], numbers: tu
 
 
 class Sensors(Section):
-    """Which topics are read."""
+    """Topics that are read."""
 
     odometry: Literal["wheel+imu", "wheel", "odometry"] = "wheel+imu"
     """Source of the body twist: speed of the wheels and turn rate of the IMU, the wheels alone, or the car's own
@@ -194,9 +194,9 @@ class Sensors(Section):
     """`detections`: pixels, from which distortion is removed on this computer; `bearings`: unit vectors of the authors'
     node."""
     distorted: bool = True
-    """Whether `bearings` come from pixels with distortion, as the authors' do."""
+    """Treat `bearings` as computed from distorted pixels, as the authors' are."""
     truth: bool = True
-    """Whether motion capture is read. It serves infos, metrics and safety, never observations."""
+    """Read motion capture. It serves infos, metrics and safety, never observations."""
 
 
 LIMITED = ("speed", "steering", "acceleration", "steering_rate")
@@ -209,7 +209,7 @@ ROLLING = 1.0
 
 
 class Safety(Section):
-    """What stops the cars. Limits above those of the profile are refused."""
+    """Limits at which the cars stop. Limits above the profile's are refused."""
 
     max_speed: float = Field(default=USUAL.speed, gt=0.0)
     """Largest speed, m/s."""
@@ -220,7 +220,7 @@ class Safety(Section):
     max_steering_rate: float = Field(default=USUAL.steering_rate, gt=0.0)
     """Largest rate of the steering angle, rad/s."""
     reverse: bool = False
-    """Whether cars may drive backwards."""
+    """Allow cars to drive backwards."""
     odometry_age: Age = 0.15
     """Time without odometry after which all cars are stopped, s."""
     truth_age: Age = 0.5
@@ -253,8 +253,8 @@ class Safety(Section):
     min_battery: float = Field(default=0.1, ge=0.0, le=1.0)
     """Share of the battery below which cars are not armed."""
     conditions: bool | None = None
-    """Whether arming needs messages of remote control, autopilot and battery, and an armed car those of the remote
-    control (default: only with `zenoh`, as the authors' cars do not send them)."""
+    """Require messages of remote control, autopilot and battery for arming, and messages of the remote control while
+    armed (default: only with `zenoh`, as the authors' cars do not send them)."""
     max_clock_offset: Positive = 0.02
     """Largest offset between the clocks of a car and of this computer for arming, s."""
 
@@ -310,13 +310,13 @@ class Deployment(Section):
     remote: Remote = Remote()
     security: Security = Security()
     fakes: bool = False
-    """Whether the cars are fakes, which are moved to the start of each episode."""
+    """Treat the cars as fakes, which are moved to the start of each episode."""
     fake: FakeSettings = Field(default=DEFAULT_FAKE, exclude=True)  # matters in the fakes' processes alone
     identified: str | None = Field(default=None, exclude=True)
     """File that `coopenv identify` has written (relative to this file): its overrides and its table `fake` replace
     those of this file."""
     file: Path = Field(default=Path(), exclude=True)
-    """Where it stands; set by `load_deployment`."""
+    """Path of the deployment; set by `load_deployment`."""
 
     @model_validator(mode="after")
     def _parts_fit_together(self) -> Self:
@@ -345,17 +345,17 @@ class Deployment(Section):
 
     @property
     def gate_connect(self) -> tuple[str, ...]:
-        """Where the gate of a car connects to: never to what is beyond the radio, unless the file does."""
+        """Addresses that a car's gate connects to; never beyond the radio unless the file states so."""
         return self.gate.connect or (WIRES[self.network.kind][0],)
 
     @property
     def folder(self) -> Path:
-        """Where the file is."""
+        """Folder of the file."""
         return self.file.parent
 
     @property
     def keys(self) -> Path | None:
-        """Where keys are; None: nothing is signed. Raises DeploymentError: there is nothing of that name."""
+        """Folder of the keys; None: nothing is signed. Raises DeploymentError: the folder does not exist."""
         if self.security.keys is None:
             return None
         place = self.folder / self.security.keys
@@ -366,7 +366,7 @@ class Deployment(Section):
 
     @property
     def conditions(self) -> bool:
-        """Whether cars must publish the conditions of remote control, autopilot and battery."""
+        """True if cars must publish the conditions of remote control, autopilot and battery."""
         return self.network.kind == "zenoh" if self.safety.conditions is None else self.safety.conditions
 
     def car(self, name: str) -> Car:
@@ -377,7 +377,7 @@ class Deployment(Section):
 
 
 class IdentifiedFile(Section):
-    """What `coopenv identify` writes."""
+    """File of `coopenv identify`."""
 
     overrides: dict[str, Any]
     fake: dict[str, Any]

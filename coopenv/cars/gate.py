@@ -162,7 +162,7 @@ class Rejected(Exception):  # noqa: N818
 
 @dataclass(frozen=True)
 class GateClock:
-    """What time it is."""
+    """Clocks of the gate."""
 
     wall: Callable[[], int]  # ns, that of stamps
     steady: Callable[[], int]  # ns, never set
@@ -203,19 +203,19 @@ class Gate:
         self._counts = dict.fromkeys(Reason, 0)
         self._state = GateMode.DISARMED
         self.nonce = secrets.token_hex(8)
-        """What the next arming has to name."""
+        """Nonce that the next arming must contain."""
         self._session, self._sequence, self._accepted = "", -1, 0
         self._wanted: MotionCommand | None = None  # by the last valid command, while it counts
         self._offset = 0
         """Wall clock less the steady one at the last arming, ns: a clock that is set later makes no command fresh."""
         self.commanded = self._ticked = clock.steady()
-        """When the last valid command came, steady clock, ns."""
+        """Time of the last valid command, steady clock, ns."""
         self._output = NEUTRAL
         self._braked = 0  # until when, steady clock, ns
 
     @property
     def braking(self) -> bool:
-        """Whether the car is being braked."""
+        """True while the gate brakes the car."""
         return self._clock.steady() < self._braked and self._wanted is None
 
     @property

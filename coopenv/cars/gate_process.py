@@ -83,7 +83,7 @@ class GateConnection:
 
     @property
     def commanded(self) -> int:
-        """When the last valid command came, steady clock, ns."""
+        """Time of the last valid command, steady clock, ns."""
         with self._lock:
             return self._gate.commanded
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 DOMAIN = b"coopenv message 1\0"
-"""What every signed text begins with, so that a signature made for anything else is none here."""
+"""Prefix of every signed text, so that signatures made for another purpose are invalid here."""
 
 SIGNATURE_BYTES = 64
 LONGEST_IDENTITY = 64  # characters, ASCII
@@ -63,7 +63,7 @@ class Verifier:
 
     @property
     def identities(self) -> tuple[str, ...]:
-        """Those whose signatures are known."""
+        """Identities with a known public key."""
         return tuple(self._keys)
 
     def signer(self, topic: str, payload: bytes, attachment: bytes) -> str | None:

@@ -187,9 +187,9 @@ class Topic(Section):
     max_age: Positive | None = None
     """Age above which a message is not used, s (default: none)."""
     urgent: bool = False
-    """Whether messages are sent at once and before others."""
+    """Send messages at once and before others."""
     reliable: bool = False
-    """Whether the sender waits instead of dropping messages."""
+    """Let the sender wait instead of dropping messages."""
     bag_names: tuple[TopicPattern, ...] = ()
     """Further names in bags."""
 
@@ -211,7 +211,7 @@ class Channel(Section):
 
 
 class Brake(Section):
-    """How the wheels are braked."""
+    """Braking of the wheels."""
 
     fields: dict[str, Number] = Field(min_length=1)
     """Fields of the message that differ from a standing car's."""
@@ -345,7 +345,7 @@ class VisionSettings(Section):
     """Time from a row to the next of a rolling shutter, s: that of the tags is added to the stamps, which are those of
     the first row."""
     rectified: bool = False
-    """Whether pixels are those of rectified frames (`image_rect`): the matrix P of CameraInfo counts, no distortion."""
+    """Treat pixels as rectified (`image_rect`): the matrix P of CameraInfo applies, without distortion."""
 
     def late(self, rows: Sequence[float], height: int) -> int:
         """Return the time, ns, from a stamp to the middle of the exposure of rows; none: of the middle row."""
@@ -354,7 +354,7 @@ class VisionSettings(Section):
 
 
 class CarProfile(Section):
-    """What differs between makes of cars."""
+    """Properties of a make of cars."""
 
     topics: dict[Role, Topic]
     """Topics by role; all roles are needed. A topic without a publisher does no harm unless it is a condition."""
@@ -373,7 +373,7 @@ class CarProfile(Section):
 
     @property
     def sees_frames(self) -> bool:
-        """Whether cameras publish frames, which `coopenv svea see` reads on the car."""
+        """True if cameras publish frames, which `coopenv svea see` reads on the car."""
         return self.topics[Role.DETECTIONS].type in IMAGES
 
     @model_validator(mode="after")

@@ -53,7 +53,7 @@ LEAST = np.array([-np.inf if kind.name in SIGNED else 1e-3 for kind in KINDS])
 
 
 class Response:
-    """What a car measured under its commands, and the model of it."""
+    """Measurements of a car under its commands, and their model."""
 
     def __init__(self, tracks: Mapping[str, Any], wheelbase: float, timeout: float, where: str) -> None:
         """Take tracks as of `tracks_of`, m, and s after which a command no longer counts. Raises DataError."""

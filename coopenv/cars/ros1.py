@@ -83,7 +83,7 @@ class TopicRoute:
 
     @property
     def exact(self) -> bool:
-        """Whether nothing is lost, so that there is a way back."""
+        """True if the conversion loses nothing and is therefore invertible."""
         return self.role not in LOSSY
 
     def out(self, payload: bytes) -> bytes:

@@ -66,7 +66,7 @@ def ray_of(calibration: Calibration, u: int, v: int) -> tuple[float, float, floa
 
 
 UNIT = 1e-3
-"""How far from 1 the length of a quaternion or a bearing may be: single precision and rounded decimals are nearer."""
+"""Tolerance of the length of a unit quaternion or bearing; single precision and rounded decimals are within it."""
 
 
 class Tag(NamedTuple):
@@ -319,7 +319,7 @@ def find_tags(gray: NDArray[np.uint8], family: str, camera: Calibration) -> list
 
 
 ALONG = np.linspace(0.12, 0.88, 16)
-"""Where a side is measured, as shares of its length: nearer to the corners its neighbours disturb."""
+"""Sample points on a side, as shares of its length; nearer to the corners the adjacent sides disturb."""
 
 SMOOTH = (np.vander(ALONG, 3) @ np.linalg.pinv(np.vander(ALONG, 3))).T
 """Replaces values along a side by those of the parabola through them: behind a lens a side is bent."""

@@ -28,7 +28,7 @@ from coopenv.cars.transport import (
 
 LEASE = 1000  # ms after which a process that has frozen no longer counts as present
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
-"""How often a lost router is tried again: a session goes on within a second or so of its being back."""
+"""Periods of reconnecting to a lost router: a session resumes about a second after the router is back."""
 
 
 class Zenoh:

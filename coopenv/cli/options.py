@@ -389,7 +389,7 @@ def refuse(given: Any, names: Collection[str], reason: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class SourceOptions:
-    """What is simulated, replayed or read."""
+    """Source to simulate, replay or read."""
 
     environment: Source
     overrides: Overrides = None

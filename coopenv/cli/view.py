@@ -44,7 +44,7 @@ SceneSource = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions(options.SourceOptions):
-    """What is shown: an environment, a record, or a saved scene."""
+    """Source of the picture: an environment, a record, or a saved scene."""
 
     environment: SceneSource
     agent: Agent = None

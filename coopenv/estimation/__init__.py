@@ -18,7 +18,7 @@ class Sight(IntEnum):
 
 
 class Outcome(IntEnum):
-    """How a vehicle's episode has ended so far."""
+    """Outcome of a vehicle's episode so far."""
 
     UNDER_WAY = 0
     ARRIVED = 1

@@ -56,7 +56,7 @@ class ObservabilityInterval(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RecordedGeometry:
-    """Where vehicles and targets were, and what was seen; axes as in `Trajectory`."""
+    """Poses of vehicles and targets, and visibility; axes as in `Trajectory`."""
 
     t: Annotated[np.ndarray, "f K"]  # s
     position: Annotated[np.ndarray, "f K N 3"]  # m, map frame

@@ -1,4 +1,4 @@
-"""What a driver achieves on held-out worlds, with intervals over worlds."""
+"""Figures of drivers on held-out worlds, with intervals over worlds."""
 
 from coopenv.evaluation.episodes import Episodes, drive, held_out_seeds
 from coopenv.evaluation.metrics import METRICS, Difference, Result, compare_paired, score

@@ -17,7 +17,7 @@ DIVERGED = 1e9  # m or deg: stands for an error that is not a number
 
 @dataclass(frozen=True)
 class Episodes:
-    """What the driven vehicles did; K decisions, W worlds, N driven vehicles. Row k is the end of decision k."""
+    """Record of the driven vehicles; K decisions, W worlds, N driven vehicles. Row k is the end of decision k."""
 
     vehicles: tuple[str, ...]
     """(N,) names."""
@@ -50,7 +50,7 @@ class Episodes:
 
     @property
     def worlds(self) -> int:
-        """How many worlds there are."""
+        """Number of worlds."""
         return int(self.outcome.shape[0])
 
     @property

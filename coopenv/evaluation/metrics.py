@@ -196,7 +196,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Difference:
-    """How much larger a figure of a driver is than that of another one on the same worlds."""
+    """Difference between a figure of a driver and that of a reference on the same worlds."""
 
     metric: str
     """Its name in `METRICS`, which has its unit."""

@@ -48,7 +48,7 @@ class SensorNoise:
     clock_offset: float = 0.0  # s, of the vehicle's clock, by which its messages are dated
     velocity_by_speed: float = 0.0  # m/s per m/s
     angular_velocity_by: tuple[float, float] = (0.0, 0.0)  # rad/s per m/s, and rad/s per rad/s
-    """What a moving vehicle's odometry samples have in addition: for odometry whose noise is proportional to motion."""
+    """Additional noise of a moving vehicle's odometry samples, proportional to its motion."""
 
     def moving(self, velocity: Array, angular_velocity: Array) -> "SensorNoise":
         """Return the noise of a sample at a velocity (3,) in m/s and an angular velocity (3,) in rad/s."""
@@ -118,8 +118,8 @@ class Setup:
     noise: SensorNoise  # standard deviations of what this vehicle senses
     gains: Gains  # of the Riccati observer
     planar: bool = False
-    """Whether the vehicle moves on a plane (z = 0, yaw only) and its odometry is the commands it was given, which
-    need calibration; so it is for recorded robots."""
+    """True for a vehicle that moves on a plane (z = 0, yaw only) and whose odometry is its commands, which need
+    calibration, such as recorded robots."""
 
 
 @dataclass(frozen=True)

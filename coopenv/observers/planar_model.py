@@ -68,7 +68,7 @@ def misfit(bearing: float, by: PlanarPose, to: PlanarPose, bearing_std: float) -
 TURNING_RATE = 1e-6  # rad/s; a smaller command is one to drive straight
 DRIVING_SPEED = 1e-6  # m/s; a smaller command is one to turn on the spot
 TURN, TURNING, PATH, ARC, SLOWING, SWITCHING, COMMANDED = range(7)
-"""What the wheels make of commands: commanded turn times gain, rad; commanded turning times gain, s; commanded path, m;
+"""Terms of the wheels' model: commanded turn times gain, rad; commanded turning times gain, s; commanded path, m;
 commanded turning, s; path times rate of turn, m rad/s; squares of the steps in the commanded rate, rad^2/s^2."""
 
 
@@ -166,8 +166,8 @@ class Tuning:
     level_std: float = 0.0  # of the logarithm of a factor on all motion noise, learnt from the innovations; 0: fixed
     wheels: Wheels = field(default_factory=Wheels)
     fusion: Literal["plain", "intersection"] = "plain"
-    """How a neighbour's covariance counts: `plain` takes its errors as independent of ours, `intersection` does not
-    (split covariance intersection with the weight that leaves the least variance)."""
+    """Fusion of a neighbour's covariance: `plain` takes its errors as independent of the own ones, `intersection` does
+    not (split covariance intersection with the weight that leaves the least variance)."""
     dependent: float = 1.0  # the share of both covariances that `intersection` takes as possibly shared errors
     arm_m: float = 0.0  # m, how far a rad of heading counts in that variance
 

@@ -55,13 +55,13 @@ class LossTest:
 
     @property
     def since(self) -> float:
-        """When the first of the last bearings that do not fit was seen, s."""
+        """Time (s) of the first of the last bearings that do not fit."""
         refused = [time for time, ratio in list(self._last)[-WINDOW:] if ratio > REFUSED]
         return refused[0] if refused else -math.inf
 
     @property
     def lost(self) -> bool:
-        """Whether most of the last bearings do not fit, or all together fit badly."""
+        """True if most of the last bearings do not fit, or all together fit badly."""
         last = list(self._last)
         short = last[-WINDOW:]
         lasting = len(short) == WINDOW and short[-1][0] - short[0][0] >= SHORTEST_S
@@ -104,7 +104,7 @@ class SightingHistory:
 
     def __init__(self) -> None:
         self._trail = np.zeros(5)
-        """Where the odometry is: x m, y m, heading rad; and the sums of its variances, rad^2 and m^2."""
+        """Odometry pose: x m, y m, heading rad; and the sums of its variances, rad^2 and m^2."""
         self._seen: deque[tuple[Sighting, Array]] = deque(maxlen=MOST)
         """With the trail at that time."""
 

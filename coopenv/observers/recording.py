@@ -1,4 +1,4 @@
-"""What vehicles sense, tick by tick: of one tick, and of a whole record."""
+"""Measurements of vehicles: of one tick, and of a whole record."""
 
 import math
 import re
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Truth:
-    """What no observer reads, of one tick or (K, ...) of several; NaN where it is not known."""
+    """True states, which no observer reads, of one tick or (K, ...) of several; NaN if unknown."""
 
     rotation: Array  # (..., N, 3, 3) body to map
     position: Array  # (..., N, 3) map, m
@@ -49,7 +49,7 @@ class Truth:
 
 @dataclass(frozen=True, kw_only=True)
 class Measurements:
-    """What N vehicles measure of T targets, of which the first L are landmarks; (K, ...) of several ticks."""
+    """Measurements by N vehicles of T targets, the first L of which are landmarks; (K, ...) for several ticks."""
 
     rotation: Array  # (..., N, 3, 3) odometry increments since the last tick
     translation: Array  # (..., N, 3) m
@@ -62,10 +62,10 @@ class Measurements:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensed(Measurements):
-    """What N vehicles sense at one tick; T targets, of which the first L are landmarks. Read-only.
+    """Measurements of N vehicles at one tick; T targets, the first L of which are landmarks. Read-only.
 
-    Ticks are the frames of the scenario's camera rate, one after the other: tick k is due at k / rate. What a source
-    has of a vehicle at that time is in its row; of a vehicle from which nothing came the row is not read.
+    Ticks are the frames of the scenario's camera rate, one after the other: tick k is due at k / rate. A vehicle's
+    row holds its measurements at that time; the row of a vehicle without data is not read.
     """
 
     index: int  # k
@@ -167,7 +167,7 @@ class Recording(Measurements):
 
     @property
     def on_a_plane(self) -> bool:
-        """Whether recorded robots drive on the plane z = 0, so that errors out of it vanish and are not judged."""
+        """True if recorded robots drive on the plane z = 0, so that errors out of it vanish and are not judged."""
         if all(setup.planar for setup in self.setups):
             return True
         return self.scenario is None and not np.nan_to_num(self.truth.position[..., 2]).any()

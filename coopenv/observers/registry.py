@@ -35,7 +35,7 @@ class ZooEntry:
     needs: str = ""  # module of the extra `bench` without which it does not run
     in_space: bool = True  # whether it is meant for vehicles in space
     on_a_plane: bool = True
-    """Whether it is meant for robots on a plane whose odometry is their commands (`Setup.planar`)."""
+    """True if it is meant for robots on a plane whose odometry is their commands (`Setup.planar`)."""
     covariance: bool = True  # whether its P is meant as a covariance, and is no matrix of gains
 
 

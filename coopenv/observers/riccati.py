@@ -305,7 +305,7 @@ def fitted(model: Any) -> Embedded:
 
 RICCATI = Embedded("riccati", make_estimate(gain_step), start_nothing, send_nothing, fit=fitted, messages=POSITION)
 KALMAN = replace(RICCATI, name="riccati_kalman", estimate=make_estimate(kalman_step), fused=True)
-"""Where every gain k is 1: the eigenvalues that other gains need are not even compiled."""
+"""Variant with every gain k equal to 1: the eigenvalues that other gains need are not even compiled."""
 
 
 def riccati(setup: Setup) -> Observer:

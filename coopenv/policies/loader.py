@@ -77,9 +77,9 @@ class AgentCard(Section):
     network: NetworkCard | None = None
     """Of a learned one: its weights, and the observation and action that it was trained with."""
     training: dict[str, Any] = Field(default={})
-    """How it was trained: command, seed, versions."""
+    """Command, seed and versions of the training."""
     results: dict[str, Any] = Field(default={})
-    """What it reached on held-out maps when it was trained."""
+    """Results on held-out maps at the end of the training."""
 
 
 class Agent(AgentCard):
@@ -90,17 +90,17 @@ class Agent(AgentCard):
     """
 
     name: str
-    """What tables call it."""
+    """Name of the agent in tables."""
     title: str = ""
     """Of its card."""
     description: str = ""
     """Of its card."""
     environments: tuple[str, ...] = ()
-    """As of its card, with absolute paths."""
+    """Environments of its card, with absolute paths."""
     code: Any = None
     """The class or function itself, if it is not named."""
     folder: Path | None = None
-    """Where its `agent.toml` and its card are; None for an import path."""
+    """Folder of its `agent.toml` and its card; None for an import path."""
 
     def policy(self, scenario: Scenario) -> Policy:
         """Return it as a policy for an environment's vehicles (`env.scenario`).

@@ -24,7 +24,7 @@ CLOSE = 20.0  # s/s for each metre that a plan comes too close to another vehicl
 
 
 class _Path(NamedTuple):
-    """Where plans have led to, (rows, plans) each, m and rad, in the own frame of the start."""
+    """Poses that plans have reached, (rows, plans) each, m and rad, in the own frame of the start."""
 
     x: np.ndarray
     y: np.ndarray
@@ -45,14 +45,14 @@ class _Path(NamedTuple):
 
 
 class _Sight(NamedTuple):
-    """What can be measured in some rows."""
+    """Measurable targets in some rows."""
 
     landmarks: np.ndarray
     """(rows, K, 2), m, own frame: those that are of use in any row."""
     known: np.ndarray
     """(rows, 1, K), which of them are."""
     boxes: list[Occluder]
-    """What hides them."""
+    """Boxes that occlude the targets."""
     view: FieldOfView
 
 

@@ -126,7 +126,7 @@ class Occluder(NamedTuple):
     there: np.ndarray
     """(rows,) bool."""
     moves: bool
-    """Whether it goes on along `forward`."""
+    """True if it continues along `forward`."""
 
 
 class Occluders:

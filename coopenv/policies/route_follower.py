@@ -26,7 +26,7 @@ class Driver(ABC):
     needs: tuple[str, ...] = ()
     """Fields of the observation without which it cannot drive."""
     remembers = 0
-    """How many numbers it remembers of every row."""
+    """Number of values that it remembers of every row."""
 
     def __init__(self, scenario: Scenario, *, cruise: float | None = None) -> None:
         """Learn where everything stands in an observation.
@@ -190,7 +190,7 @@ class RouteFollower(Driver):
         self.blocking = reach + 0.4 * GAP
         """Distance, m, below which a vehicle blocks the way."""
         self.foresight = 6.0 if nimble else stopping + REACTION
-        """How far ahead to look for others, s."""
+        """Time (s) ahead in which other vehicles count."""
         self.period = 1.0 / scenario.rates.decision
         self._last = (np.zeros((0, 0), dtype=bool), *(np.zeros((0, 0, 0)) for _ in range(4)), np.zeros(0))
         """Of the last decision: messages, places, directions, ages and motions of their senders, and s of standing."""

@@ -75,7 +75,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What Gymnasium registered, with the horizon in decisions as `max_episode_steps`."""
+        """The specification in Gymnasium's registry, with the horizon in decisions as `max_episode_steps`."""
         return self._spec
 
     @spec.setter

@@ -1,4 +1,4 @@
-"""One run of an environment: simulate it, judge it, write it down."""
+"""One run of an environment: simulate, judge and save it."""
 
 from typing import TYPE_CHECKING
 

@@ -43,19 +43,19 @@ Count = Annotated[int, Field(ge=0)]
 
 
 class RunEnd(Section):
-    """How a run ended."""
+    """End of a run."""
 
     tick: Count
     error: str
     """Empty: none."""
     by_driver: bool = False
-    """Whether the error was the driver's, which is not replayed."""
+    """True if the error was the driver's; a driver is not replayed."""
     figures: dict[Literal["position_error", "orientation_error"], list[float | None]]
     """Last errors of the vehicles, m and deg; none: not known."""
 
 
 class Manifest(Section):
-    """What a run was."""
+    """Description of a run."""
 
     format: Literal["coopenv-run 2"] = "coopenv-run 2"
     environment: str
@@ -210,7 +210,7 @@ class Bundle:
 
     @property
     def title(self) -> str:
-        """What ran."""
+        """Title of the run."""
         about = self.manifest
         return f"{about.environment}, {about.observer}, seed {about.seed}, {about.end.tick} ticks"
 

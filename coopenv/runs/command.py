@@ -226,7 +226,7 @@ _NEEDED = ("environment", "seed", "policy", "overrides", "versions", "steady_fro
 
 @dataclass(frozen=True, eq=False)
 class Results(Tabular):
-    """What a run has come to, as in its folder; printed, it is its table.
+    """Results of a run, as in its folder; printed, it is its table.
 
     The trajectory as a table: `to_pandas`, `to_polars`, `to_xarray`, `to_csv` and `to_parquet`.
     """
@@ -242,7 +242,7 @@ class Results(Tabular):
     scenario: Scenario | None = None
     """The world of the run; None where only its file has it, such as a recording."""
     files: tuple[Path, ...] = ()
-    """What was written."""
+    """Files that were written."""
 
     @classmethod
     def read(cls, folder: str | Path) -> "Results":
@@ -323,7 +323,7 @@ class Results(Tabular):
 
     @property
     def ends(self) -> list[float]:
-        """When each vehicle ended, s; NaN: it did not."""
+        """Time (s) of each vehicle's end; NaN: still under way."""
         return [float(row["ended_at_s"]) for row in self.metrics["vehicles"]]
 
     @property

@@ -50,7 +50,7 @@ class Progress:
         self._log, self._description, self._total, self._completed = log, description, total, 0.0
         self._rate, self._hinted, self._waiting = rate, False, True
         self._first: tuple[float, float] | None = None
-        """When the first parts were done, s, and how much they were; compiling may have made them slow."""
+        """Time (s) and amount of the first parts, which compiling may have slowed down."""
         self._burst = inf
         """Until when parts count as first ones, s: processes side by side finish theirs together."""
         self._over = threading.Event()

@@ -155,7 +155,7 @@ class Demo:
     seconds: float = 0.0
     """Further seeds are driven until the cars have driven so long, s."""
     beside: bool = False
-    """Whether the same seeds are simulated, too, and stand beside."""
+    """Simulate the same seeds, too, and show them beside."""
     deployment: Path | None = None
     """One's own deployment file, whose cars are fakes; `environment` is its environment then."""
     time: float = field(default=0.0, init=False)

@@ -121,7 +121,7 @@ KEPT = ("observation", "actions", "reward", "terminated", "truncated", "position
 
 @dataclass(frozen=True)
 class DrivenEpisode:
-    """What one vehicle observed, did and got, until it ended or its world did; T decisions."""
+    """Observations, actions and rewards of one vehicle until it ended or its world did; T decisions."""
 
     world: int
     vehicle: str

@@ -30,7 +30,7 @@ RECORDED = (
 
 
 class Ending(NamedTuple):
-    """How a vehicle's run ended: in the words of infos, and when, s (`under way`: the end of the record)."""
+    """End of a vehicle's run: outcome in the words of infos, and time, s (`under way`: the end of the record)."""
 
     outcome: str
     time: float

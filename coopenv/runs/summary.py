@@ -272,7 +272,7 @@ COLUMNS = {
     "variants": ("name", "of", "about"),
     "scenes": ("name", "options", "about"),
 }
-"""What the tables show of the rows."""
+"""Columns of the rows that the tables show."""
 
 
 def environment_rows(scenarios: Mapping[str, Scenario]) -> list[dict[str, Any]]:

@@ -47,7 +47,7 @@ class Viewer:
         self._live, self._near = not reel.abilities.pace, 1.0
         self._due = self._shown_at = self._faded_at = -np.inf
         self.shown = 0
-        """How many frames have been sent."""
+        """Number of frames sent."""
         self._show(monotonic())
 
     def pick(self, vehicle: int | None) -> None:

@@ -1,4 +1,4 @@
-"""What a world is: typed, validated, read from `envs/*.toml`."""
+"""Description of a world: typed, validated, read from `envs/*.toml`."""
 
 from coopenv.base.installation import scenario_path
 from coopenv.scenario.files import ScenarioLike, load_scenario, parse_scenario, scenario_name

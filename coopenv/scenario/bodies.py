@@ -1,4 +1,4 @@
-"""Who and what is in the scene: landmarks, vehicles, buildings, and how they move."""
+"""Bodies of the scene: landmarks, vehicles, buildings, and their motions."""
 
 import math
 from collections.abc import Mapping
@@ -53,7 +53,7 @@ class Road(Section):
     end: Vector2
     width: Positive
     marked: bool = True
-    """Whether a dashed line marks its middle."""
+    """Draw a dashed line along the middle."""
 
 
 class StaticMotion(Section):
@@ -73,7 +73,7 @@ class ConstantMotion(Section):
 
 
 class TwistSegment(Section):
-    """One body twist held for a while."""
+    """Constant body twist for a duration."""
 
     duration: Positive
     """s"""
@@ -162,7 +162,7 @@ def _has_one_orientation(given: Oriented) -> Oriented:
 
 
 class InitialPose(Section):
-    """Where an agent starts, fixed or drawn anew at each reset; one with routes starts on that which it draws."""
+    """Start of an agent, fixed or drawn anew at each reset; an agent with routes starts on the drawn route."""
 
     position: Vector3 | None = None
     """In the coordinates of this file, m; needed without routes."""
@@ -207,7 +207,7 @@ class InitialEstimate(Section):
 
 
 class Goal(Section):
-    """Where a driven vehicle wants to go; one with routes to the end of that which it draws."""
+    """Goal of a driven vehicle. With routes, the goal is the end of the drawn route."""
 
     position: Vector3 | None = None
     """In the coordinates of this file, m; needed without routes."""
@@ -239,7 +239,7 @@ class Landmark(Section):
 
     @property
     def is_drawn(self) -> bool:
-        """Whether a reset draws where it is, or whether it is there."""
+        """True if a reset draws its position or its presence."""
         return self.group is not None or any(self.position_spread) or self.presence < 1.0
 
 
@@ -276,7 +276,7 @@ class Vehicle(Section):
 
     @property
     def goal_radius(self) -> float:
-        """How near to its goal the vehicle has arrived, m; 0 without a goal."""
+        """Distance to the goal, m, within which the vehicle has arrived; 0 without a goal."""
         return (self.goal or Goal()).radius if self.goal or self.routes else 0.0
 
     @field_serializer("camera", "noise", "dynamics", "faults")
@@ -356,7 +356,7 @@ class LandmarkGroup(Section):
 
     @property
     def weights(self) -> list[float]:
-        """How large each area is, or how long each line, m^2 or m."""
+        """Size of each area, m^2, or length of each line, m."""
         boxes = [4.0 * b.half[0] * b.half[1] for b in self.boxes]
         return [*boxes, *(math.dist(line.start, line.end) for line in self.lines)]
 

@@ -36,14 +36,14 @@ class Cosimulator(Section):
     program: ClassVar[str]
     """Its `coopenv.backends.cosimulation.TrafficProgram`, `module:class`, made from the scenario."""
     reference_midway: ClassVar[bool] = False
-    """Whether its vehicles' reference point is midway between the axles instead of the rear one."""
+    """True if its vehicles' reference point is midway between the axles instead of on the rear axle."""
 
     most_vehicles: int = Field(default=40, ge=0, le=10_000)
     """Vehicles on its road at most, besides those of this file: the traffic that only occludes and collides."""
 
     @property
     def roads(self) -> str:
-        """What roads and traffic are made of, in words."""
+        """Source of roads and traffic, in words."""
         return self.title
 
 
@@ -59,11 +59,11 @@ class Highway(Cosimulator):
     config: dict[str, Setting] = Field(default={})
     """Its own configuration by key; settings of this file (rates, sizes of actions) are not repeated here."""
     dynamical: bool = False
-    """Whether driven vehicles have tyres that slip (highway-env's BicycleVehicle); otherwise its kinematic bicycle."""
+    """Give driven vehicles tyres that slip (highway-env's BicycleVehicle); otherwise its kinematic bicycle."""
 
     @property
     def roads(self) -> str:
-        """What roads and traffic are made of, in words."""
+        """Source of roads and traffic, in words."""
         return f"{self.title}'s `{self.id}`"
 
 
@@ -84,7 +84,7 @@ class Sumo(Cosimulator):
     warm_up: NonNegative = 60.0
     """Traffic before the episode begins, s."""
     posts: bool = True
-    """Whether a landmark stands at the right of the stop line of every road into a junction."""
+    """Place a landmark at the right of the stop line of every road into a junction."""
     post_height: Positive = 3.0
     """m"""
     landmarks: Word = "landmark"
@@ -96,7 +96,7 @@ class Sumo(Cosimulator):
     options: dict[str, Setting] = Field(default={})
     """SUMO's own options by name; those that follow from settings of this file are not repeated here."""
     included: bool = False
-    """Whether this file has the roads, landmarks, buildings and routes of SUMO's files; written by coopenv."""
+    """True if this file contains the roads, landmarks, buildings and routes of SUMO's files; written by coopenv."""
 
 
 class Program(Cosimulator):
@@ -134,7 +134,7 @@ Shape = np.ndarray
 
 @dataclass
 class SumoNetwork:
-    """What is read of a network."""
+    """Content of a network file that a scenario uses."""
 
     center: tuple[float, float] = (0.0, 0.0)
     lanes: dict[str, list[tuple[Shape, float]]] = field(default_factory=dict)

@@ -31,7 +31,7 @@ COUNT_OVERRIDE = re.compile(r"vehicles\.(\d+|\*)\.count")
 OVERRIDES = "overrides"  # where a field stands that an override has made wrong
 
 ScenarioLike = str | Path | Mapping[str, Any] | Scenario
-"""What stands for a scenario: its name (`facade`, `lane:20`), its TOML file, the contents of such a file, or itself."""
+"""A scenario, its name (`facade`, `lane:20`), its TOML file, or the contents of such a file."""
 
 
 @explained

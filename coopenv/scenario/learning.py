@@ -1,4 +1,4 @@
-"""What a policy sees, does and is rewarded for."""
+"""Observation, action, reward and termination of a policy."""
 
 import math
 from collections.abc import Iterable
@@ -34,7 +34,7 @@ class Observation(Section):
     exclude: tuple[str, ...] = Field(default=(), json_schema_extra=_list_groups)
     """Groups and fields that are left out of those again, for what an ablation does without."""
     planar: bool = False
-    """Whether to leave out what a vehicle on a plane cannot change: heights, roll and pitch."""
+    """Omit heights, roll and pitch, which a vehicle on a plane cannot change."""
     position_scale: Positive = 50.0
     """m, of positions and distances"""
     velocity_scale: Positive = 5.0
@@ -81,7 +81,7 @@ class Dynamics(Section):
     max_speed: Positive = 1.53
     """m/s, forwards"""
     reverse: bool = False
-    """Whether negative speeds are possible."""
+    """Allow negative speeds."""
     max_acceleration: Positive = 2.0
     """m/s^2"""
     max_steering: float = Field(default=0.6981317007977318, gt=0.0, lt=1.5)
@@ -97,8 +97,8 @@ class Dynamics(Section):
     dead_band: NonNegative = 0.0
     """Speed commands of a smaller magnitude do not move the car, as its speed controller has them, m/s."""
     gated: bool = False
-    """Whether commands change from one decision to the next by no more than the acceleration and `max_steering_rate`
-    permit, as the gate of a SVEA car sees to; otherwise it is the car alone that takes its time."""
+    """Limit the change of commands between decisions by the acceleration and `max_steering_rate`, as the gate of a SVEA
+    car does; otherwise only the car's own dynamics limit it."""
 
     @model_validator(mode="after")
     def _can_move(self) -> Self:
@@ -126,9 +126,9 @@ class Action(Section):
     pan: Pan | None = None
     """None: cameras do not turn."""
     radio: bool = False
-    """Whether further entries, one per other vehicle in ascending order, choose what is sent to it until the next
-    decision: up to 0 nothing, up to 0.5 the pose alone, for its driver, above 0.5 the whole report, for its estimator,
-    too. Otherwise reports are broadcast."""
+    """Add an entry per other vehicle, in ascending order, for the message to it until the next decision: up to 0 none,
+    up to 0.5 the pose alone, for its driver, above 0.5 the whole report, for its estimator, too. Otherwise reports are
+    broadcast."""
 
 
 _built_in: dict[str, Any] = {
@@ -192,7 +192,7 @@ class Reward(Section):
 
 
 class Termination(Section):
-    """What ends an agent's episode before the horizon: a switch for every condition, its own and those of coopenv."""
+    """Conditions that end an agent's episode before the horizon: a switch for each, its own and built-in ones."""
 
     model_config = ConfigDict(
         extra="allow",
@@ -309,10 +309,10 @@ class Difficulty(_Factors):
 
     @property
     def matters(self) -> bool:
-        """Whether anything depends on it."""
+        """True if any factor depends on the level."""
         return any(easy != hard for easy, hard in map(self.factors, PARAMETERS))
 
     @property
     def neutral(self) -> bool:
-        """Whether every factor is 1 at its level: as if there were no difficulties."""
+        """True if every factor is 1 at its level, as without difficulties."""
         return all(easy + (hard - easy) * self.number == 1.0 for easy, hard in map(self.factors, PARAMETERS))

@@ -23,7 +23,7 @@ STRAIGHT = 1e-6  # rad; a smaller turn at a waypoint is no corner
 
 @dataclass(frozen=True, eq=False)  # arrays cannot be compared where routes are
 class Shape:
-    """What is between the L + 1 waypoints of a route, and at them."""
+    """Geometry of a route's L legs and L + 1 waypoints."""
 
     length: np.ndarray  # (L,) m
     heading: np.ndarray  # (L,) rad

@@ -56,11 +56,11 @@ class Scenario(Section, metaclass=_Loaded):
     title: Text
     description: Text = ""
     source: Text = ""
-    """Where the figures come from."""
+    """Source of the numbers."""
     horizon: Positive
     """Length of an episode, s."""
     backend: Literal["simulated", "highway", "sumo", "program"] = "simulated"
-    """What moves the vehicles: coopenv itself, or a co-simulator with the section of this name."""
+    """Simulator that moves the vehicles: coopenv itself, or a co-simulator with the section of this name."""
     highway: Highway | None = None
     sumo: Sumo | None = None
     program: Program | None = None
@@ -76,9 +76,9 @@ class Scenario(Section, metaclass=_Loaded):
     noise: Noise = Noise()
     topology: Topology = Topology()
     sensing: Literal["sensed", "ideal", "blind"] = "sensed"
-    """One switch for studies of what looking is worth; all else stays equal, noise, radio and draws included.
-    `ideal`: every neighbour is measured in every frame, whatever the field of view, range, misses and what is in
-    between; `blind`: nothing is ever measured; `sensed`: by `topology.mode`."""
+    """Switch for studies of the value of sensing; all else stays equal, noise, radio and draws included.
+    `ideal`: every neighbour is measured in every frame, regardless of field of view, range, misses and occluders;
+    `blind`: nothing is ever measured; `sensed`: by `topology.mode`."""
     v2x: V2x = V2x()
     faults: Faults = Faults()
     observer: ObserverSettings = ObserverSettings()
@@ -127,7 +127,7 @@ class Scenario(Section, metaclass=_Loaded):
 
     @property
     def paced(self) -> bool:
-        """Whether the pace of prescribed motions may vary."""
+        """True if the pace of prescribed motions may vary."""
         factors = (*self.randomisation.factors("traffic_pace"), *self.difficulty.factors("traffic_pace"))
         spreads = (*(mark.pace_spread for mark in self.landmarks), *(vehicle.pace_spread for vehicle in self.vehicles))
         return any(factor != 1.0 for factor in factors) or any(spreads)
@@ -144,12 +144,12 @@ class Scenario(Section, metaclass=_Loaded):
 
     @property
     def keeps_those_in_range(self) -> bool:
-        """Whether vehicles keep what is in range, and no lists of all that they may measure are made."""
+        """True if vehicles keep the agents in range, without lists of all measurable targets."""
         return self.topology.most_nearby is not None and self.vehicles[0].neighbours is None
 
     @property
     def driven(self) -> bool:
-        """Whether any vehicle is driven by actions."""
+        """True if actions drive any vehicle."""
         return any(vehicle.motion.kind == "driven" for vehicle in self.vehicles)
 
     @property
@@ -159,19 +159,19 @@ class Scenario(Section, metaclass=_Loaded):
 
     @property
     def acting(self) -> list[bool]:
-        """Whether actions drive each vehicle."""
+        """For each vehicle, True if actions drive it."""
         driven = [vehicle.motion.kind == "driven" for vehicle in self.vehicles]
         return [each and driver is None for each, driver in zip(driven, self.drivers, strict=True)]
 
     @property
     def action_size(self) -> int:
-        """How many entries an action has."""
+        """Number of entries of an action."""
         radio = len(self.vehicles) - 1 if self.action.radio else 0
         return (2 if self.action.pan is None else 3) + radio
 
     @property
     def has_lasting_errors(self) -> bool:
-        """Whether any vehicle's odometry or camera has errors that last, see `[noise]` and `[camera]`."""
+        """True if any vehicle's odometry or camera has lasting errors, see `[noise]` and `[camera]`."""
         noises, cameras = self.noises, self.cameras
         return any(n.enabled and (n.lasts or c.is_misplaced) for n, c in zip(noises, cameras, strict=True))
 
@@ -187,7 +187,7 @@ class Scenario(Section, metaclass=_Loaded):
 
     @property
     def all_faults(self) -> list[Faults]:
-        """What may go wrong with every vehicle."""
+        """Faults of every vehicle."""
         return [overlaid(self.faults, vehicle.faults) for vehicle in self.vehicles]
 
     @property

@@ -1,6 +1,6 @@
-"""How vehicles sense, talk and estimate: camera, rates, noise, topology, V2X, observer.
+"""Sensing, communication and estimation: camera, rates, noise, topology, V2X, observer.
 
-Off by default. What is a chance or a standard deviation is drawn per vehicle and episode.
+Off by default. Chances and standard deviations apply per vehicle and episode.
 """
 
 import math
@@ -83,9 +83,9 @@ class Camera(Section):
     distortion: tuple[Number, Number, Number, Number, Number] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3 of the plumb-bob model."""
     undistort: bool = True
-    """Whether bearings are computed from undistorted pixels."""
+    """Compute bearings from undistorted pixels."""
     quantise: bool = False
-    """Whether detections come in whole pixels."""
+    """Round detections to whole pixels."""
     range: Positive | None = None
     """Farthest distance at which a target is detected, m (none: unlimited)."""
     miss_probability: Probability = 0.0
@@ -107,7 +107,7 @@ class Camera(Section):
 
     @property
     def is_misplaced(self) -> bool:
-        """Whether the true camera differs from the nominal one."""
+        """True if the true camera differs from the nominal one."""
         return any((self.extrinsics_error, self.extrinsics_position_error, self.focal_length_error))
 
 
@@ -187,13 +187,13 @@ class Noise(Section):
 
     @property
     def lasts(self) -> bool:
-        """Whether the odometry has errors that last."""
+        """True if the odometry has lasting errors."""
         errors = (self.odometry_scale, self.odometry_scale_walk, self.gyro_bias, self.gyro_bias_walk, self.slip.rate)
         return any(np.any(error) for error in errors)
 
 
 class Topology(Section):
-    """Which targets a vehicle measures, and whose messages it receives."""
+    """Targets that a vehicle measures, and senders that it receives."""
 
     mode: Literal["fixed", "sensed"] = "fixed"
     """`fixed`: every neighbour at every tick; `sensed`: those in the field of view and not occluded."""
@@ -260,7 +260,7 @@ class Restart(Section):
     """A vehicle whose computer starts anew: its observer loses all, and begins again knowing nothing of its pose."""
 
     chance: Probability = 0.0
-    """That it happens to the vehicle in an episode."""
+    """Probability that the vehicle restarts in an episode."""
     time: NonNegative = 0.0
     """When, s; it takes place at the next decision, never in the first one."""
     time_spread: NonNegative = 0.0
@@ -287,7 +287,7 @@ class Lie(Section):
     """`jump`: a position off by `offset`; `drift`: one that walks away at `speed`; `replay`: its own message of `age`
     before, as if it were new; `collude`: as `jump`, and all that collude are off by the same, drawn once for them."""
     chance: Probability = 1.0
-    """That the vehicle lies in an episode; drawn once for all that collude."""
+    """Probability that the vehicle lies in an episode; drawn once for all colluding vehicles."""
     start: NonNegative = 0.0
     """From when on, s."""
     start_spread: NonNegative = 0.0
@@ -297,7 +297,7 @@ class Lie(Section):
     turn: NonNegative = 0.0
     """Of all but `replay`: about its own z axis, added to its attitude, rad."""
     odometry: Literal["consistent", "honest"] = "consistent"
-    """Whether the odometry in its messages, if they have one, leads where the lie does or where the vehicle drives."""
+    """Odometry in its messages, if any: `consistent` with the lie, or `honest`, the vehicle's own."""
     speed: Positive = 0.05
     """Of `drift`, m/s."""
     age: Annotated[float, Field(gt=0.0, le=LONGEST_REPLAY)] = 1.0
@@ -305,14 +305,14 @@ class Lie(Section):
     direction: Direction | None = None
     """Of what is added to the position, map axes, of any length (default: horizontal, drawn)."""
     std: Positive | None = None
-    """What it claims to know its pose by, rad and m (default: its honest covariance)."""
+    """Claimed standard deviation of its pose, rad and m (default: its honest covariance)."""
 
 
 class MapError(Section):
     """Landmarks whose place on a vehicle's map is wrong; a wrong entry is the same on all maps that have it."""
 
     chance: Probability = 0.0
-    """That an entry is wrong in an episode, drawn per landmark."""
+    """Probability that an entry is wrong in an episode, drawn per landmark."""
     landmark: str | None = Field(default=None, max_length=64)
     """Name of the landmark (default: any may be wrong)."""
     offset: NonNegative = 1.0
@@ -331,7 +331,7 @@ class Jammer(Section):
     """A jammer that the vehicle carries: receivers in its range lose all messages, its own receiver too."""
 
     chance: Probability = 0.0
-    """That the vehicle has one in an episode."""
+    """Probability that the vehicle has a jammer in an episode."""
     range: Positive | None = None
     """m (none: unlimited)."""
     position: Vector3 | None = None
@@ -349,7 +349,7 @@ class Jammer(Section):
 
 
 class Faults(Section):
-    """What goes wrong with a vehicle's computer, clock, map and messages."""
+    """Faults of a vehicle's computer, clock, map and messages."""
 
     clock_offset: NonNegative = 0.0
     """Standard deviation of what the vehicle's clock is off by, s. Messages seem older or newer by the difference of
@@ -362,11 +362,11 @@ class Faults(Section):
 
     @property
     def alters(self) -> bool:
-        """Whether any message differs from its sender's estimate."""
+        """True if any message differs from its sender's estimate."""
         return self.lie.kind != "none" or self.corruption.probability > 0.0
 
     @property
     def any(self) -> bool:
-        """Whether anything may go wrong."""
+        """True if any fault may occur."""
         chances = self.restart.chance, self.map_error.chance, self.jammer.chance
         return self.alters or self.clock_offset > 0.0 or max(chances) > 0.0

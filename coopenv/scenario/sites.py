@@ -48,7 +48,7 @@ class Building(NamedTuple):
 
 
 class Site(NamedTuple):
-    """What a scene is made of. With a range, visibility is sensed; without, the graph is fixed."""
+    """Parts of a scene. With a range, visibility is sensed; without, the graph is fixed."""
 
     vehicles: Sequence[PlacedVehicle]
     landmarks: Mapping[str, Point] = LANDMARKS

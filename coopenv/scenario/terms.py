@@ -170,8 +170,8 @@ Scale = Literal[
 ]
 """A setting of `[observation]`, the steering or the pan angle at action 1, or the number of targets."""
 Per = Literal["vehicle", "target", "neighbour", "landmark"]
-"""One value of the vehicle itself, one of every target (landmarks, then vehicles), one of every other vehicle, or one
-of each of the landmarks that are nearest by the vehicle's own estimate."""
+"""Subjects of a value: the vehicle itself, every target (landmarks, then vehicles), every other vehicle, or each of the
+landmarks that are nearest to the vehicle's own estimate."""
 
 
 class TermRow(Section):
@@ -209,7 +209,7 @@ class Term(TermRow):
     """A term of the reward, or a condition that ends a vehicle's episode."""
 
     privileged: bool = False
-    """Whether it uses the truth, as every function of two records does."""
+    """True if it uses the truth, as every function of two records does."""
 
     @property
     def described(self) -> str:
@@ -222,7 +222,7 @@ class ObservationField(TermRow):
     """A field of the observation; every entry is (value - center) / scale, clipped to [low, 1]."""
 
     group: Text = ""
-    """What `observation.include` calls it; empty: its own name."""
+    """Its name in `observation.include`; empty: its own name."""
     per: Per = "vehicle"
     size: int = Field(default=1, ge=1, le=64)
     """Entries of one value."""
@@ -306,7 +306,7 @@ def check_privilege(kind: Registry[Term], used: Mapping[str, float], part: Any) 
 GROUPS = tuple(FIELDS)
 """Groups of fields of coopenv, in their order in an observation."""
 USUAL_GROUPS = ("estimate", "quality", "bearings", "odometry", "messages", "goal")
-"""Those of a scenario that does not name any."""
+"""Groups of a scenario that names none."""
 VALUES = "coopenv.api.terms.records"
 """Module that computes the values of the built-in fields and reward terms, in the order of their rows."""
 

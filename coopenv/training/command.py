@@ -205,7 +205,7 @@ def _judge(trainer: Trainer | SetTrainer, threads: int | None, report: Reports, 
 
 
 class Checkpoint(BaseModel):
-    """What a file holds."""
+    """Contents of a checkpoint file."""
 
     model_config = ConfigDict(ser_json_inf_nan="constants")
     format: int = FORMAT
@@ -216,7 +216,7 @@ class Checkpoint(BaseModel):
     """`steps`, `seconds` and `cpu_seconds`."""
     curve: list[dict[str, int | float]]
     onnx: bool = False
-    """Whether an ONNX model is to be written, too, as the command line said."""
+    """Write an ONNX model, too, as on the command line."""
     logs: Path | None = None
     """Its folder for TensorBoard; None: in the agent's folder."""
     path: Path = Field(default=Path(), exclude=True)

@@ -119,7 +119,7 @@ class SetTrainer:
 
     @property
     def status(self) -> Status:
-        """How far it is."""
+        """Progress of the training."""
         return Status(0, self.seconds, 1.0, {})
 
 

@@ -162,14 +162,14 @@ class Settings(Section):
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """What is to be trained; two runs of one plan and one version on one machine give the same policy."""
+    """Plan of a training; two runs of one plan and one version on one machine give the same policy."""
 
     environment: str
     settings: Settings
     seed: int
     arm: str | None = None
     overrides: Mapping[str, Any] | None = None
-    """Those of the command line, after those of the settings."""
+    """Overrides of the command line, applied after the overrides of the settings."""
 
     @property
     def all_overrides(self) -> dict[str, Any]:

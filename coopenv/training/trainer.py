@@ -1,4 +1,4 @@
-"""One training: the batch, Stable-Baselines3's PPO on it, and how far it is. Needs the extra `train`."""
+"""One training: the batch, Stable-Baselines3's PPO on it, and its progress. Needs the extra `train`."""
 
 import math
 from collections import deque
@@ -34,7 +34,7 @@ SEEN = 256
 
 @dataclass(frozen=True)
 class Status:
-    """How far a training is, and how the exploring policy did lately."""
+    """Progress of a training, and recent figures of the exploring policy."""
 
     steps: int
     """Decisions of vehicles so far."""
@@ -153,7 +153,7 @@ class MixedWorlds(CooperativeSB3VecEnv):
 
 
 class NormalisedEnv(VecEnvWrapper):
-    """What a policy learns from: normalised observations of vehicles under way, rewards of order one.
+    """Wrapper for learning: normalised observations of vehicles under way, rewards of order one.
 
     Unlike SB3's `VecNormalize` it leaves parked vehicles out of the statistics and is saved without pickle. Returns in
     `info["episode"]` stay in the units of the scenario.
@@ -292,7 +292,7 @@ TORCH_REFUSES = "Expected parameter"
 
 
 class DivergedError(CoopenvError):
-    """What was learnt is not finite."""
+    """A learnt parameter is not finite."""
 
 
 class Trainer:
@@ -426,7 +426,7 @@ class Trainer:
 
     @property
     def status(self) -> Status:
-        """How far the training is."""
+        """Progress of the training."""
         return Status(self.model.num_timesteps, self.seconds, self._spent(), self._watch.figures())
 
     def _spent(self) -> float:

@@ -153,7 +153,7 @@ _HELVETICA = ("Arial", "Helvetica", "Nimbus Sans", "TeX Gyre Heros", "Liberation
 
 
 class Column(NamedTuple):
-    """How a journal sets figures of one width."""
+    """Typesetting of a journal's figures of one width."""
 
     inches: float
     size: float

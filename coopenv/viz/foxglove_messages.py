@@ -69,7 +69,7 @@ class RunView:
         """Take what is shown; with `gain` the observer's P is a gain matrix, and no covariance."""
         r, self.recording, self.run, self.clock, self.gain = recording, recording, run, clock, gain
         self.ticks = range(0, r.ticks, max(1, round(1.0 / (_RATE * r.dt))))
-        """Those that are shown, at most 20 a second."""
+        """Ticks to show, at most 20 a second."""
         self.names = [setup.name for setup in r.setups]
         known = np.atleast_1d(r.truth.known.any(axis=0))
         self.bodies = [(name if known[i] else f"{name}/estimate", i) for i, name in enumerate(self.names)]

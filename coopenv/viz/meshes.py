@@ -116,7 +116,7 @@ class Look:
     sight: bool = True
     """Lines of sight."""
     alone: bool = False
-    """Whether the picked vehicle alone has lines of sight."""
+    """Show lines of sight of the picked vehicle alone."""
     views: bool = True
     """Fields of view."""
     messages: bool = True
@@ -127,7 +127,7 @@ class Look:
     picked: int | None = None
     """Index of the vehicle that is looked at."""
     follow: bool = True
-    """Whether the view goes along with it."""
+    """Let the view follow it."""
 
 
 def linear(colours: np.ndarray) -> np.ndarray:
@@ -136,7 +136,7 @@ def linear(colours: np.ndarray) -> np.ndarray:
 
 
 class Copies(NamedTuple):
-    """Where copies are; those that are not there have size zero."""
+    """Poses of copies; absent copies have size zero."""
 
     wxyzs: np.ndarray  # (N, 4)
     positions: np.ndarray  # (N, 3) m

@@ -99,7 +99,7 @@ class Frame:
 
     @property
     def landmarks(self) -> int:
-        """How many agents are landmarks."""
+        """Number of landmarks among the agents."""
         return len(self.position) - len(self.estimate_position)
 
     @property
@@ -150,7 +150,7 @@ class Origin(Section):
     terms: tuple[str, ...] = ()
     """Names of the reward terms of a frame."""
     honest: bool = True
-    """Whether the observer's P is meant as a covariance; of the paper's it is a gain matrix."""
+    """True if the observer's P is a covariance; the paper's P is a gain matrix."""
 
     @classmethod
     def of(cls, name: str, scenario: Scenario, **more: Any) -> Self:
@@ -168,7 +168,7 @@ class Origin(Section):
 
 
 class SceneHeader(Section):
-    """What the file of a scene says of its arrays."""
+    """Description of the arrays in the file of a scene."""
 
     frames: int = Field(ge=1)
     source: Origin

@@ -247,7 +247,7 @@ class Stage:
 
     @cached_property
     def sees_a_part(self) -> bool:
-        """Whether cameras have a field of view that matters."""
+        """True if a camera has a limited field of view that counts."""
         s = self.scenario
         sensed = s.topology.mode == "sensed" and s.sensing == "sensed"
         return sensed and any(camera.model == "pinhole" for camera in s.cameras)

@@ -1,4 +1,4 @@
-"""What the figures share: a palette safe for colour-blind readers, the paper's names, time axes, places of names."""
+"""Style of the figures: a palette safe for colour-blind readers, the paper's names, time axes, places of names."""
 
 import re
 import warnings

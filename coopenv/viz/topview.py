@@ -34,7 +34,7 @@ class PictureWindow:
 
     @property
     def is_open(self) -> bool:
-        """Whether there is a window that the user has not closed."""
+        """True if the window exists and the user has not closed it."""
         if self._image is None:
             return False
         from matplotlib import pyplot as plt

@@ -1,4 +1,4 @@
-"""What stands still under the top view: axes, roads, buildings, names of landmarks, and the panel's legend."""
+"""Static background of the top view: axes, roads, buildings, names of landmarks, and the panel's legend."""
 
 from collections.abc import Sequence
 from typing import Any, cast

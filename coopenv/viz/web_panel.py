@@ -122,7 +122,7 @@ class Abilities:
     observers: Sequence[str] = ()
     """Observers to choose from; the first one runs."""
     faults: Sequence[str] = ()
-    """That can be switched on."""
+    """Faults that can be switched on."""
 
 
 _SWITCHES = {

@@ -184,7 +184,7 @@ def level_lines(frame: Frame, colours: np.ndarray, look: Look, largest: float, z
 
 
 class Trails:
-    """Where vehicles have been in the last seconds."""
+    """Positions of vehicles in the last seconds."""
 
     def __init__(self) -> None:
         """Start without points."""

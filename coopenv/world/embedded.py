@@ -1,6 +1,6 @@
-"""What the world is handed: an observer, and a source of ticks, each as a few Warp functions.
+"""Interface of the world to an observer and a source of ticks, each a few Warp functions.
 
-The world knows neither; `coopenv.world.step` makes kernels of them.
+The world imports neither; `coopenv.world.step` builds kernels from them.
 """
 
 from collections.abc import Callable, Mapping
@@ -59,7 +59,7 @@ def regular_tick(model: Any, tick: int):
 
 @dataclass(frozen=True)
 class Messages:
-    """How what an embedded observer sends looks to observers on the host (`coopenv.observers.kernel_observer`)."""
+    """Host format of an embedded observer's messages (`coopenv.observers.kernel_observer`)."""
 
     write: Callable[[Any], Any]
     """(KernelObserver): return the `Message` that `send` has broadcast."""
@@ -100,8 +100,8 @@ class Embedded:
     fit: Callable[[Any], "Embedded"] | None = None
     """(model): return the variant to compile for a model; None: this one."""
     valid: Mapping[str, Rule] = field(default_factory=dict, hash=False)
-    """What a saved memory may hold, by field. Without a rule numbers have to be finite and whole ones may be any: give
-    one to every index and count."""
+    """Rules for a saved memory, by field. Without a rule, floats must be finite and integers are unrestricted: give
+    every index and count a rule."""
     messages: Messages | None = None
     """Its messages on the host; None: it sends the V2X pose estimate alone."""
     coordinates: Coordinates = Coordinates.RICCATI
@@ -109,8 +109,8 @@ class Embedded:
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """Options of the Warp module that it is compiled in."""
     fused: bool = False
-    """Whether simulated worlds run it in one kernel with the simulation. A single world is then a tenth faster, batches
-    are not, and it is compiled once more."""
+    """Run it in one kernel with the simulation in simulated worlds. A single world is then a tenth faster, batches are
+    not, and the observer is compiled once more."""
 
     def __post_init__(self) -> None:
         """Refuse what is no such function. Raises CoopenvError."""
@@ -127,13 +127,13 @@ class Embedded:
 
     @property
     def starts(self) -> bool:
-        """Whether anything of it happens where an episode begins."""
+        """True if the observer acts at the start of an episode."""
         return self.start is not start_nothing or self.send is not send_nothing
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where the ticks of a world come from."""
+    """Source of the ticks of a world."""
 
     name: str
     begin: Any  # (model, state, record, world): go to the start of an episode

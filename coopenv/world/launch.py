@@ -33,7 +33,7 @@ ATTEMPTS = 3
 PROBE_BYTES = 5 << 20  # as much as the source and the code of a large module have
 LONGEST_COMPILATION = 120.0  # s; a process that holds a lock for longer is taken for suspended (Ctrl-Z)
 _MODULE, _LOCKS = "wp_", "locks"
-"""How names of folders of modules begin; the folder of the locks."""
+"""Prefix of the folders of modules; folder of the locks."""
 _loaded: set[str] = set()  # names of modules that this process has loaded
 
 

@@ -86,7 +86,7 @@ def model_struct(p: Precision) -> Any:
 
     @wp.struct
     class StartValues:
-        """How an episode begins. Angles in rad, lengths in m, map frame."""
+        """Start of an episode. Angles in rad, lengths in m, map frame."""
 
         position: wp.array(dtype=vec3)  # (A,)
         rotation: wp.array(dtype=mat33)  # (A,)
@@ -163,9 +163,9 @@ def model_struct(p: Precision) -> Any:
 
     @wp.struct
     class Routes:
-        """Where vehicles go: vehicle i draws one of the routes choice[first[i]] .. choice[first[i + 1] - 1].
+        """Routes of vehicles: vehicle i draws one of the routes choice[first[i]] .. choice[first[i + 1] - 1].
 
-        One without routes goes straight to its goal.
+        A vehicle without routes goes straight to its goal.
         """
 
         first: wp.array(dtype=wp.int32)  # (N + 1,)
@@ -185,7 +185,7 @@ def model_struct(p: Precision) -> Any:
 
     @wp.struct
     class DrawRanges:
-        """What else a world draws at a reset, G groups of landmarks with Y areas in all."""
+        """Ranges of further draws at a reset, G groups of landmarks with Y areas in all."""
 
         presence: wp.array(dtype=scalar)  # (A,) chance to be there
         any_driven: wp.int32
@@ -267,7 +267,7 @@ def model_struct(p: Precision) -> Any:
 
     @wp.struct
     class FaultValues:
-        """What goes wrong with a vehicle's computer, clock and messages."""
+        """Faults of a vehicle's computer, clock and messages."""
 
         clock: scalar  # standard deviation, s
         restart_chance: scalar
@@ -324,7 +324,7 @@ def model_struct(p: Precision) -> Any:
 
     @wp.struct
     class Judgement:
-        """What the terms about an estimate's quality compare with."""
+        """References of the terms about an estimate's quality."""
 
         uncertainty_threshold: scalar  # m
         uncertainty_cap: scalar  # m

@@ -1,4 +1,4 @@
-"""What is near a vehicle: bodies, found by a grid of cells, and the agents that it keeps.
+"""Neighbourhood of a vehicle: bodies, found by a grid of cells, and the agents that it keeps.
 
 A uniform grid of square cells finds bodies near a place, exactly: users test what is in the cells of a window. The grid
 has `across` cells along x and as many along y, and repeats: a window no larger than the grid meets each of its cells

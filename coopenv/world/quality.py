@@ -1,4 +1,4 @@
-"""How good an estimate is: errors, NEES, log-determinant, and the sliding observability Gramian of what is measured."""
+"""Quality of an estimate: errors, NEES, log-determinant, and the sliding observability Gramian of the measurements."""
 
 from typing import Any
 

@@ -45,7 +45,7 @@ LIE = wp.constant(wp.uint32(43))
 CORRUPTION = wp.constant(wp.uint32(44))
 MAP_ERROR = wp.constant(wp.uint32(46))
 JAMMER = wp.constant(wp.uint32(47))
-"""Where six numbers are drawn, the next stream gives the second half."""
+"""For six numbers, the next stream gives the second half."""
 
 
 @wp.func

@@ -38,7 +38,7 @@ ABSENT = wp.constant(-1)
 """Value of `ended` of a vehicle that is not there in this episode."""
 
 EVERY_VEHICLE = wp.constant(-1)
-"""As a subject of random numbers: all vehicles of a world."""
+"""All vehicles of a world, as a subject of random numbers."""
 
 
 @wp.func
@@ -87,7 +87,7 @@ def keep_one_vehicle(model: Any, state: Any, world: int):
 
 
 ATTEMPTS = wp.constant(16)
-"""How often the start of a vehicle with routes is drawn until it touches nothing that is there already."""
+"""Number of draws of a start on a route, until the vehicle touches no other body."""
 
 
 @wp.func

@@ -153,7 +153,7 @@ def repeated(row: Any, axis: int, count: int) -> Any:
 
 
 TOLERANCE = {np.dtype(np.float32): 1e-4, np.dtype(np.float64): 1e-6}
-"""How far rotations and directions may be off in a precision."""
+"""Tolerance of rotations and directions in a precision."""
 LEAST_EIGENVALUE = {np.dtype(np.float32): -1e-4, np.dtype(np.float64): -1e-9}
 """Least eigenvalue of the correlations of a covariance, after rounding in a precision."""
 

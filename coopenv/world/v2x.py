@@ -34,7 +34,7 @@ NEVER = wp.constant(-1)
 NOTHING = wp.constant(0)
 POSE = wp.constant(1)
 REPORT = wp.constant(2)
-"""What a message holds for a receiver."""
+"""Contents of a message for a receiver."""
 POSE_BYTES = wp.constant(56)
 """Three numbers of 8 bytes, and a quaternion."""
 MOST_CLOCK_TICKS = wp.constant(1.0e8)

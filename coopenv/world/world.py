@@ -111,11 +111,10 @@ class World:
         shares, lanes = threads_and_lanes(worlds, N, self.device, threads)
         self.threads = max(shares, lanes) if self.device == "cpu" else 1
         self.observer = observer if observer.fit is None else observer.fit(self.model)
-        """What estimates in the kernels; `HOST` where estimates are written from outside, see `PlugIns`."""
+        """Observer in the kernels; `HOST` if estimates are written from outside, see `PlugIns`."""
         self.model.coordinates = COORDINATES.index(self.observer.coordinates)
         self.in_parts = self.device != "cpu" and len(self.observer.parts) > 1
-        """Whether the observer's parts are kernels of their own; on the CPU that would only load a world's state more
-        often."""
+        """True if the observer's parts are separate kernels; on the CPU they would only reload a world's state."""
         sizes = {**state_sizes(self.model, worlds), **self.observer.sizes}
         needed = size_of(state_struct(self.precision), sizes) + size_of(self.observer.memory, {**sizes, SCRATCH: lanes})
         check_memory(needed, f"num_worlds: {worlds}", device_memory(self.device))
@@ -127,7 +126,7 @@ class World:
         self.model.start.covariance = wp.array(anew, dtype=mat66d, device=self.device)
         shared = "" if lanes == N else SCRATCH
         self.memory = allocate(self.observer.memory, sizes, self.device, shared, interleaves_worlds(self.device))
-        """What the embedded observer remembers besides the state."""
+        """Memory of the embedded observer besides the state."""
         others = [with_own_scratch(self.memory, sizes) for _ in range(1, self.threads)] if lanes > 1 else []
         self._memories = PerLane([PerWorld(memory) for memory in (self.memory, *others)])
         self._turns = allocate(Turns, {**sizes, "D": N + 1, "F": 2}, self.device)
@@ -206,7 +205,7 @@ class World:
 
     @property
     def _world_kernels(self) -> Kernels:
-        """Those of the source with the observer, or without it."""
+        """Kernels of the source with the observer, or without it."""
         if self.observer.fused and self.source.fused and self.launch.lanes == 1:
             return fused_kernels(self.source, self.observer, self.precision)
         return source_kernels(self.source, self.precision)

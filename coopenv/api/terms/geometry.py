@@ -1,4 +1,4 @@
-"""How the records of terms are filled: estimate, route, map, targets and neighbours of one vehicle."""
+"""Computation of the records of terms: estimate, route, map, targets and neighbours of one vehicle."""
 
 from typing import Any
 

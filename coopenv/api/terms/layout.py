@@ -1,4 +1,4 @@
-"""Which entry of an observation or action means what: the published tables, and the spaces built from them."""
+"""Meaning of each entry of an observation or action: the published tables, and the spaces built from them."""
 
 from __future__ import annotations
 

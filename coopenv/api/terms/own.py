@@ -40,19 +40,19 @@ class OwnTerm(NamedTuple):
     """Kind and name, for errors."""
     function: wp.Function
     records: int
-    """How many it takes."""
+    """Number of records that the function takes."""
     kernel: Callable[["OwnTerm"], wp.Kernel]
     place: int
     """First entry in the observation, place among the reward terms, or outcome of a condition."""
     returns: str = "a number"
-    """What the function is to return."""
+    """Expected return value of the function."""
     weight: float = 0.0
     """Of a reward term."""
     per: str = "vehicle"
     size: int = 1
     """Entries of one value."""
     entries: tuple[int, ...] = (0,)
-    """Those that the observation holds."""
+    """Indices of the entries that the observation holds."""
     center: float = 0.0
     scale: float = 1.0
 

@@ -19,7 +19,7 @@ except ImportError as error:
 
 
 class CooperativeMultiAgentEnv(MultiAgentEnv):
-    """One world as RLlib wants it.
+    """One world as an RLlib `MultiAgentEnv`.
 
     Differs from RLlib's `ParallelPettingZooEnv` in what it says at the horizon: `truncateds["__all__"]`, and nothing of
     single vehicles. An episode whose agents are all flagged, be it as truncated, counts as terminated in RLlib (2.60):

@@ -80,7 +80,7 @@ class CooperativeSB3VecEnv(VecEnv):
 
     @property
     def engine(self) -> Engine:
-        """That of the batch; a copy of a batch builds its own."""
+        """The engine of the batch; a copy of a batch builds its own."""
         return self.envs.engine
 
     @property

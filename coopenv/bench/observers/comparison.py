@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Comparison(Leaderboard, Tabular):
-    """How observers did on the same records, as tables, files and figures.
+    """Results of observers on the same records, as tables, files and figures.
 
     Printed, it is its tables; `found["riccati"]` has the results of one observer. Tables of whole runs, or with
     `windows=True` of every window of time: `to_pandas`, `to_polars`, `to_xarray`, `to_csv` and `to_parquet`.
@@ -192,7 +192,7 @@ def compare(
 
 @dataclass(frozen=True)
 class Plan:
-    """What is compared: names and numbers that are known to exist."""
+    """Observers, records and numbers of a comparison, all checked to exist."""
 
     source: RecordSource
     observers: tuple[str, ...]
@@ -247,7 +247,7 @@ class Plan:
 
     @property
     def tasks(self) -> list[Task]:
-        """One record and its observers each.
+        """Tasks of one record each, with its observers.
 
         Raises:
             CoopenvError: the steady state would start beyond the record.

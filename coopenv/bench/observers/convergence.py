@@ -34,7 +34,7 @@ ANGLE_BINS = tuple(range(0, 181, 30))  # deg
 
 @dataclass(frozen=True)
 class Draw:
-    """How one vehicle fared from one draw of the initial estimates: a line of `basin.csv`."""
+    """Result of one vehicle from one draw of the initial estimates: a line of `basin.csv`."""
 
     draw: int
     observer: str
@@ -42,7 +42,7 @@ class Draw:
     initial_orientation_error_deg: float
     initial_position_error_m: float
     converged: bool
-    """Whether the vehicle ends within CONVERGED."""
+    """True if the vehicle's final error is within CONVERGED."""
     convergence_time_s: float
     """From then on the errors stay within CONVERGED; NaN where they do not."""
     final_position_error_m: float
@@ -52,7 +52,7 @@ class Draw:
 
 @dataclass(frozen=True)
 class Basin:
-    """How many draws converge."""
+    """Number of draws that converge."""
 
     environment: str
     observer: str

@@ -55,10 +55,10 @@ class WorldFault(FaultKind):
     key: str = ""
     """Of the value; start and options are keys of the same section."""
     renamed: Mapping[str, str] = field(default_factory=dict)
-    """Those keys that are not called like the option, or `start`."""
+    """Keys whose name differs from that of the option, or from `start`."""
     vehicles: bool = True
     of_one: bool = False
-    """Whether the usual sender alone has the fault by default; else all vehicles."""
+    """Apply the fault by default to the usual sender alone; otherwise to all vehicles."""
 
 
 FAULTS: dict[str, RecordFault | WorldFault] = {

@@ -1,4 +1,4 @@
-"""One record, judged: the errors of every observer against the truth and the bounds."""
+"""Judgement of one record: the errors of every observer against the truth and the bounds."""
 
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -43,7 +43,7 @@ class TimeWindow(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Name of the window in tables."""
         return STEADY if self.steady else f"{self.start:g}-{self.end:g} s"
 
     def ticks(self, t: Array) -> NDArray[np.bool_]:
@@ -78,7 +78,7 @@ class RecordProperties:
     bound: Array
     """(S, N) m, joint."""
     paper_noise: bool
-    """Whether bearings are noisy on the image plane, and so less than the bound assumes off the optical axis."""
+    """True for bearing noise on the image plane, which off the optical axis is below the bound's assumption."""
     figures: tuple[float, ...] = ()
     """Figures in which another record differs: bearings, deliveries, and the root mean squares of bearings along x, of
     measured velocities, m/s, and of the last true positions, m."""
@@ -92,7 +92,7 @@ class RecordProperties:
 
 
 class Series(NamedTuple):
-    """What figures show, at `RecordProperties.t`; arrays (S, N)."""
+    """Time series of the figures, at `RecordProperties.t`; arrays (S, N)."""
 
     position_error: Array  # m
     position_std: Array  # m, NaN where the observer states no covariance
@@ -207,7 +207,7 @@ RELATIVE_DELTA = 1.0  # s between the poses of a pair of the relative trajectory
 
 @dataclass(frozen=True)
 class Task:
-    """One record and its observers, its parts; small, so that it travels to a worker."""
+    """One record with its observers, the parts of the task; small, because it is sent to a worker."""
 
     source: RecordSource
     variant: str
@@ -220,7 +220,7 @@ class Task:
 
     @property
     def world(self) -> tuple[RecordSource, str]:
-        """What the records of all seeds have in common."""
+        """Source and variant, which the records of all seeds share."""
         return self.source, self.variant
 
     def parts(self, done: int = 0, ended: Mapping[str, str] = MappingProxyType({})) -> Iterator[JudgedRun | None]:

@@ -295,13 +295,13 @@ def spread(rows: Sequence[Row] | Sequence[WindowRow], column: str) -> Spread:
 
 @dataclass(frozen=True, eq=False)
 class Leaderboard:
-    """How observers did on the same records, summed up over seeds."""
+    """Results of observers on the same records, summed up over seeds."""
 
     environment: str
     """Name of the environment, dataset or log file."""
     observers: tuple[str, ...]
     variants: Mapping[str, str]
-    """Those that were run, each with what it is."""
+    """The variants that were run, with a description each."""
     seeds: tuple[int, ...]
     samples: Sequence[JudgedRun] = field(repr=False)
     """One observer on one record each, by variant, observer, seed."""
@@ -315,7 +315,7 @@ class Leaderboard:
 
     @cached_property
     def rows(self) -> list[Row]:
-        """One per variant, observer and vehicle."""
+        """One row per variant, observer and vehicle."""
         return [
             row_of(self.environment, own, self.groups.get((NOMINAL, observer), []), i)
             for (_, observer), own in self.groups.items()
@@ -324,7 +324,7 @@ class Leaderboard:
 
     @cached_property
     def window_rows(self) -> list[WindowRow]:
-        """One per variant, observer, window and vehicle; the last window is the steady state."""
+        """One row per variant, observer, window and vehicle; the last window is the steady state."""
         return [
             window_row_of(self.environment, own, i, w)
             for own in self.groups.values()
@@ -351,7 +351,7 @@ class Leaderboard:
 
     @property
     def title(self) -> str:
-        """What was compared, on one line."""
+        """Title of the comparison, on one line."""
         first, last = self.seeds[0], self.seeds[-1]
         whole = len(self.seeds) > 1 and self.seeds == tuple(range(first, last + 1))
         seeds = f"{first} to {last}" if whole else ", ".join(map(str, self.seeds))

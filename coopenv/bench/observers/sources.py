@@ -1,4 +1,4 @@
-"""Where the benchmark's records come from: a simulated environment, recorded robots, or a log file.
+"""Sources of the benchmark's records: a simulated environment, recorded robots, or a log file.
 
 A source is small and picklable, so that a worker process makes the record itself.
 """
@@ -48,17 +48,17 @@ class RecordSource(ABC):
     """
 
     name: str
-    """As it stands in the rows."""
+    """Name of the source in the rows."""
     added: tuple[FaultVariant, ...] = field(default=(), kw_only=True)
     """Variants with faults that have parameters."""
     named: ClassVar[Mapping[str, str]] = {name: variant.summary for name, variant in VARIANTS.items()}
     """The others, each with what it is."""
     usual: ClassVar[tuple[str, ...]] = (NOMINAL,)
-    """Those that are run unless others are asked for."""
+    """Variants that are run by default."""
     seeded: ClassVar[bool] = False
-    """Whether another seed gives another record."""
+    """True if the record depends on the seed."""
     windowed: ClassVar[bool] = True
-    """Whether windows of time from the start on are judged by default: of robots on a plane they are not."""
+    """Judge windows of time from the start on by default; robots on a plane have none."""
 
     @property
     def variants(self) -> dict[str, str]:
@@ -80,7 +80,7 @@ class RecordSource(ABC):
 
     @property
     def planar(self) -> bool:
-        """Whether its vehicles are robots on a plane; observers suit either these or vehicles in space."""
+        """True if the vehicles are robots on a plane; observers suit either these or vehicles in space."""
         world = self.world()
         return isinstance(world, Recording) and all(setup.planar for setup in world.setups)
 
@@ -161,11 +161,11 @@ class Robots(RecordSource):
         "Friendly: robots start at their true pose; who is seen is known from barcodes, "
         "their own left out; the wheels' response was fitted to these robots; all receive from all, 10 Hz, no loss."
     )
-    """What tables of recorded robots are to be read with."""
+    """Options for reading tables of recorded robots."""
 
     @property
     def planar(self) -> bool:
-        """Whether observers get commands on a plane, or odometry in space."""
+        """True if observers get commands on a plane, False for odometry in space."""
         return not self.name.endswith(IN_SPACE)
 
     def world(self) -> Recording:

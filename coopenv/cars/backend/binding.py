@@ -47,7 +47,7 @@ class Binding:
 
     @property
     def remote(self) -> bool:
-        """Whether some vehicles are estimated elsewhere."""
+        """True if some vehicles are estimated on another computer."""
         return len(self.local) < len(self.cars)
 
 

@@ -1,7 +1,7 @@
-"""What cars have published last: samples at any time between, and their conditions.
+"""Buffers of the cars' latest messages: interpolated samples, and conditions.
 
-Samples are odometry, motion capture, moving landmarks and camera frames. A condition is why a car is not armed, or is
-stopped.
+Samples are odometry, motion capture, moving landmarks and camera frames. A condition is the reason for which a car
+is not armed, or is stopped.
 """
 
 import threading
@@ -40,7 +40,7 @@ class Odometer:
 
     @property
     def stamp(self) -> int | None:
-        """When the older one of the last velocity and the last turn rate was taken; None: one has never come."""
+        """Stamp, ns, of the older of the last velocity and the last turn rate; None: one of them has never come."""
         return min(self._stamps.values()) if len(self._stamps) == 2 else None
 
     def put(self, stamp: int, twist: Twist) -> None:

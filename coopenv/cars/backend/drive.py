@@ -65,7 +65,7 @@ class DriveRecorder:
             raise OutputError(f"{path}: exists already")
         self._path, self._types = path, {**types, **MARKS}
         self.begun = False
-        """Whether an episode has begun: without one there is nothing to replay."""
+        """True after the first episode has begun: before it there is nothing to replay."""
         self._sequence = 0
         self._error: OSError | None = None
         with writing(path):

@@ -24,7 +24,7 @@ from coopenv.observers.contract import Message
 
 @dataclass(frozen=True)
 class Place:
-    """Where a car is."""
+    """Position of a car."""
 
     position: Array  # (3,) m, in the coordinates of the scenario's file
     time: int  # ns, when that was known
@@ -79,7 +79,7 @@ class LinkMonitor:
         self.places: Mapping[str, Place] = {}
         """Replaced as a whole whenever one changes."""
         self.looked = self._begun = now
-        """When messages were looked at last."""
+        """Time of the last check of messages."""
         self._nis: dict[str, deque[tuple[int, float]]] = {}
         self._recent: dict[str, deque[Place]] = {}
         self._doubts: dict[str, tuple[str, int]] = {}  # why an estimate is wrong, and since when, ns

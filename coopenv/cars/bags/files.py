@@ -28,7 +28,7 @@ LATEST = 4 * 10**18  # ns, in 2096: sums of two such times fit into 64 bits
 
 
 class BagFile:
-    """One bag, open; a context manager."""
+    """An open bag; a context manager."""
 
     def __init__(self, path: Path) -> None:
         """Open a bag.

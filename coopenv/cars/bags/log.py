@@ -42,7 +42,7 @@ Delays = Mapping[str, int]
 
 @dataclass(frozen=True)
 class Shift:
-    """What is done to the stamps of a source."""
+    """Correction of the stamps of a source."""
 
     offset: int | None  # ns by which its clock is behind that of the first recorder; None: not known
     added: int  # ns that are added to its stamps
@@ -50,7 +50,7 @@ class Shift:
 
 @dataclass(frozen=True)
 class Clocks:
-    """How times of a bag become those of one clock."""
+    """Conversion of the times of a bag to one clock."""
 
     shifts: Mapping[str, Shift]  # by source
     recorders: tuple[int, ...]  # ns to add to the times of reception of each file
@@ -315,7 +315,7 @@ def regularity(stamps: np.ndarray) -> tuple[float | None, float | None, int | No
 
 @dataclass(frozen=True)
 class BagLog:
-    """What was read."""
+    """Result of reading a bag."""
 
     samples: tuple[Sample, ...]  # in the order of their stamps, which all are on one clock
     rows: tuple[TopicRow, ...]  # what there is, by topic

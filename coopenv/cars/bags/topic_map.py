@@ -88,7 +88,7 @@ class Topics(Section):
 
     @property
     def given(self) -> dict[Role, str]:
-        """What is set, by role."""
+        """Topics that are set, by role."""
         return {role: name for role in READ if (name := getattr(self, role.value)) is not None}
 
 
@@ -108,7 +108,7 @@ class BagCar(Car):
 
     @property
     def names(self) -> dict[str, str]:
-        """What stands for it in the names of a scheme."""
+        """Placeholders of the car in the names of a scheme."""
         agent = self.name if self.agent_number is None else f"agent{self.agent_number}"
         return {"car": self.name, "agent": agent, "body": self.body or self.name}
 
@@ -147,7 +147,7 @@ class Correction(Section):
 
 
 class ClockSettings(Section):
-    """How times are read."""
+    """Settings for reading times."""
 
     mode: Literal["auto", "stamps", "received"] = "auto"
     """`auto`: stamps, shifted by the offset of their clock if that exceeds `tolerance`; `stamps`: unchanged stamps;
@@ -164,7 +164,7 @@ TURN = round(2.0 * math.pi, 4)  # rad
 
 
 class MapFrame(Section):
-    """Where the frame of positions in a bag is in the environment's coordinates."""
+    """Pose of the bag's position frame in the environment's coordinates."""
 
     position: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
     """Origin of the frame in the environment's coordinates, m."""
@@ -182,7 +182,7 @@ class PositionFrames(Section):
 
 
 class TopicMap(Section):
-    """What a bag holds."""
+    """Topics, cars and frames of a bag."""
 
     environment: str
     """Name of an environment, or TOML file (relative to this file): landmarks, cameras, noise and observer."""
@@ -205,7 +205,7 @@ class TopicMap(Section):
     camera: Literal["auto", "detections", "bearings"] = "auto"
     """Source of bearings; `auto`: detections if the bag has them, or else bearings."""
     distorted: bool = True
-    """Whether `bearings` come from pixels with distortion, as the authors' do."""
+    """Treat `bearings` as computed from distorted pixels, as the authors' are."""
     start: float = Field(default=0.0, ge=0.0, le=1e6)
     """Time left out after all needed topics have begun, s."""
     duration: Positive | None = None
@@ -244,7 +244,7 @@ class CalibratedClocks(Section):
 
 
 class CalibrationFile(Section):
-    """What `coopenv calibrate` writes."""
+    """Calibration file of `coopenv calibrate`."""
 
     overrides: dict[str, Any]
     clocks: CalibratedClocks
@@ -296,7 +296,7 @@ class Chosen:
 
     @property
     def needed(self) -> bool:
-        """Whether there are no ticks without it."""
+        """True if ticks cannot be built without it."""
         return self.leads or self.role not in UNNEEDED
 
     @property

@@ -30,7 +30,7 @@ LATE = 50_000_000
 
 
 class Fake:
-    """One fake car, a vehicle or a moving landmark; `advance` does all that is due, in one thread."""
+    """A fake car, a vehicle or a moving landmark; `advance` runs all due events in one thread."""
 
     def __init__(
         self,
@@ -110,7 +110,7 @@ class Fake:
 
     @property
     def next(self) -> int:
-        """When something is due next, steady clock, ns."""
+        """Time of the next event, steady clock, ns."""
         return int(min(self._events.queue[0].time, self._wire.next))
 
     def add_fault(self, fault: Fault) -> None:

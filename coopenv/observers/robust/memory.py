@@ -59,7 +59,7 @@ class SenderReport:
 
 @wp.struct
 class Member:
-    """One vehicle in a belief."""
+    """One vehicle of a joint state."""
 
     vehicle: wp.int32
     box: wp.int32  # of its messages at this tick, see `coopenv.world.nearby`
