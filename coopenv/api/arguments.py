@@ -135,16 +135,16 @@ class Info(TypedDict):
     """Normalised error squared in the coordinates in which the observer states P; in the mean its degrees of freedom
     (6, on a plane 3) for a consistent estimate."""
     log_determinant: float
-    """Of P."""
+    """Log-determinant of P."""
     position_std: float
     """m, root of the trace of the position's covariance in the map frame."""
     gramian_min_eigenvalue: float
-    """Of the observability Gramian, mixed units."""
+    """Smallest eigenvalue of the observability Gramian, mixed units."""
     protection_level: list[float]
     """Bounds that the observer states, of the horizontal error, m, and the angle, rad; infinite: unknown, or none."""
     reward_terms: dict[str, float]
     time: float
-    """s since the reset."""
+    """Time since the reset, s."""
     outcome: str
     """`under way`, `arrived`, `collided`, `off route`, or a condition of the scenario's own."""
     late_ticks: int
@@ -152,7 +152,7 @@ class Info(TypedDict):
     missing_ticks: int
     """Camera ticks of this step in which nothing came from the vehicle, which has gone on with its last odometry."""
     car: NotRequired[dict[str, Any]]
-    """Of real cars: link and gate."""
+    """Link and gate of a real car."""
 
 
 FLAGS = ("alive", "terminated", "truncated", "ended")

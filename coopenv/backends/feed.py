@@ -33,7 +33,7 @@ from coopenv.world.state import allocate, array, fields
 from coopenv.world.v2x import draw_faults, transmit
 
 BY_RADIO = wp.constant(-2)
-"""In place of the ticks of sending of received messages: the scenario's radio decides."""
+"""Value in place of the ticks at which received messages were sent: the scenario's radio decides."""
 
 
 @wp.func

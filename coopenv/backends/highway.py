@@ -190,7 +190,7 @@ class Simulation(TrafficProgram):
 
     @property
     def roads(self) -> tuple[Road, ...]:
-        """Its lanes."""
+        """Lanes of its road network."""
         return drawn_roads(self.environment.road.network, self._scenario)
 
     def reset(self, seed: int) -> None:

@@ -32,7 +32,7 @@ BLIND_ROBOTS = (3, 4, 5)
 TICK_S = 0.05
 MESSAGE_PERIOD_TICKS = 2  # 10 Hz, as V2X radios send
 NOISE = SensorNoise(velocity=0.15, angular_velocity=0.3, odometry_period=TICK_S, bearing=0.03)
-"""For all sub-datasets. The commands' errors are no sensor noise but last; as white noise they amount to
+"""Noise of all sub-datasets. The commands' errors are lasting, not sensor noise; as white noise they amount to
 0.03 m and 0.07 rad per square root of a second."""
 SPATIAL_NOISE = SensorNoise(
     velocity=0.002 / math.sqrt(TICK_S),
@@ -42,7 +42,7 @@ SPATIAL_NOISE = SensorNoise(
     velocity_by_speed=0.12 / math.sqrt(TICK_S),
     angular_velocity_by=(0.1 / math.sqrt(TICK_S), 0.2 / math.sqrt(TICK_S)),
 )
-"""Of odometry by the wheels' response. Tuned on the first 300 s of sub-dataset 6."""
+"""Noise of odometry by the wheels' response. Tuned on the first 300 s of sub-dataset 6."""
 TRAPEZOID_S = TICK_S / 2
 """Added to the commands' lead: observers in space take a held sample for half a period late, which it is not here."""
 ZENITH, ZENITH_PERIOD_TICKS = (0.0, 0.0, 1e6), 40

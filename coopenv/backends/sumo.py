@@ -47,10 +47,10 @@ OPTIONS: Mapping[str, Any] = {
 """SUMO's options unless the scenario gives others."""
 
 INSERTION = 60.0
-"""s that SUMO may take until there is room for the driven vehicles."""
+"""Longest wait (s) for SUMO to have room for the driven vehicles."""
 
 PATIENCE = 5.0
-"""s that the process may take to end."""
+"""Longest wait (s) for the process to end."""
 
 
 class SumoProgram(TrafficProgram):

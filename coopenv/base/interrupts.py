@@ -13,7 +13,7 @@ from typing import NoReturn
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 PATIENCE = 1.0
-"""s that a command has to end by itself. One that is within a long call of a library, such as a compiler, cannot."""
+"""Time (s) for a command to end by itself. A command within a long library call, such as a compiler, cannot."""
 REMINDERS = 10  # signals that are sent again to the main thread meanwhile
 WITH_INPUT = "COOPENV_END_WITH_INPUT"
 """Environment variable of a process that ends as soon as its standard input does."""

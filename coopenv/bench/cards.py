@@ -45,7 +45,7 @@ OF_MESSAGES: dict[str, dict[str, Any]] = {
 
 
 BACK = 1.2
-"""By which landmarks are set back, from the origin."""
+"""Factor by which landmarks are set back from the origin."""
 
 
 def stress(scenario: Scenario) -> dict[str, dict[str, Any]]:

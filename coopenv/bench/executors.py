@@ -47,9 +47,9 @@ class ProcessLimits:
     """Time and memory limits of an observer on one record."""
 
     seconds: float = 1800.0
-    """Of processor time."""
+    """Limit of processor time, s."""
     mebibytes: float = 8192.0
-    """Of memory, besides what its process had before."""
+    """Limit of memory, MiB, besides the earlier use of its process."""
 
 
 @contextmanager
@@ -141,7 +141,7 @@ class Pool:
         self.tasks, self.jobs, self.limits = tasks, jobs, limits
         self.waiting = deque(range(len(tasks)))
         self.results: list[list[Any]] = [[] for _ in tasks]
-        """Of the parts of each task that are done."""
+        """Results of the finished parts of each task."""
         self.ended: list[tuple[str, Any, str]] = []
         """Observers that are not started again, the world in which (None: everywhere), and why."""
         self.workers: list[_Worker] = []
@@ -248,7 +248,7 @@ class Local:
 
     jobs: int
     limits: ProcessLimits | None = None
-    """Of observers, in `coopenv.bench.observers.judge.judge_all`; None: none, and they may run in this process."""
+    """Limits of observers, in `coopenv.bench.observers.judge.judge_all`; None: no limits, and they may run here."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.jobs, int) or self.jobs < 1:

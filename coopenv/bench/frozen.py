@@ -51,7 +51,7 @@ class FrozenScene(NamedTuple):
     source: SimulatedRecords
     variant: str
     hash: str
-    """Of its scenario, fault, policy or actions, and seeds."""
+    """Hash of its scenario, fault, policy or actions, and seeds."""
 
 
 @dataclass(frozen=True)
@@ -86,13 +86,13 @@ class Frozen:
 
     @property
     def seeds(self) -> range:
-        """Of every scene."""
+        """Seeds of every scene."""
         first = self.definition["first"]
         return range(first, first + self.definition["seeds"])
 
     @property
     def limits(self) -> ProcessLimits:
-        """Of every observer."""
+        """Limits of every observer."""
         return ProcessLimits(self.definition["seconds"], self.definition["memory"])
 
     def scenes(self, names: Sequence[str] = ()) -> list[FrozenScene]:
@@ -155,7 +155,7 @@ class Frozen:
 
     @property
     def digest(self) -> str:
-        """Of the definition."""
+        """SHA-256 of the definition."""
         return sha256(self._text.encode()).hexdigest()
 
     def _remarks(self, found: Mapping[str, Any], limits: ProcessLimits) -> list[str]:

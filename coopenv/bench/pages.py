@@ -31,7 +31,7 @@ from coopenv.viz.scene import Origin, SceneRecord
 from coopenv.viz.topview import TopView
 
 FORMATS, MOST_BYTES = ((6.0, 448), (3.0, 320), (3.0, 240)), 280_000
-"""Of films: pictures a second, and their width in pixels; the first that makes no larger file is taken, or the last."""
+"""Formats of films: pictures a second and width, px; the first within the limit counts, or the last. Limit in bytes."""
 _LASTS = 8.0  # s, at most
 _SEED = 0
 _IDLE = "zero"  # the driver of a scene without a route
@@ -235,7 +235,7 @@ def fingerprint(scenario: Scenario) -> str:
 
 INDEX = "README.md"
 COLOURS, REFINED = 256, 2
-"""Of a picture, which is a drawing: so it takes a third of the bytes; rounds in which they are improved."""
+"""Palette size of a picture, which saves two thirds of the bytes of a drawing, and rounds that improve the palette."""
 
 
 def prepare(folder: Path, names: list[str]) -> None:
@@ -302,7 +302,7 @@ def plain(text: str) -> str:
 GLANCE = ("Vehicles", "Targets", "Camera", "Odometry", "V2X", "Observer", "Rates")
 """Facts that no table below repeats."""
 MOST_ROWS = 40
-"""Of a table of vehicles, routes, landmarks or buildings."""
+"""Most rows of a table of vehicles, routes, landmarks or buildings."""
 SHOWN_ELSEWHERE = {"observation.include", "observation.scales", "observation.centers", "reward.privileged"}
 """Settings that other tables show, as they show the weights."""
 

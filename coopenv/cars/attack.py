@@ -263,7 +263,7 @@ class AttackOutcome:
     through: int = 0
     """Commands that a gate accepted or found at the wheels, and answers to queries."""
     speed: float = math.nan
-    """Of the fastest car, m/s; NaN: not known."""
+    """Speed of the fastest car, m/s; NaN: unknown."""
 
     @property
     def harmful(self) -> bool:

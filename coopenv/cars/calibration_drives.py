@@ -33,7 +33,7 @@ ROLES = (
     *((Role.DETECTIONS, Role.BEARINGS), (Role.WHEEL, Role.ODOMETRY), (Role.TRUTH,)),
     (Role.IMU, Role.ODOMETRY, Role.WHEEL),
 )
-"""Of the topics of camera, wheels, motion capture and turn rates."""
+"""Roles of the topics of camera, wheels, motion capture and turn rates."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ STOPPED = "coopenv_msgs/msg/Stopped"
 """Type of the message there with the reason for which the watchdog stopped the cars."""
 
 MOST_BYTES, MOST_FRAME = 65_536, 2**25
-"""Of one message, and of a frame of a camera."""
+"""Most bytes of a message, and of a camera frame."""
 
 
 @cache

@@ -203,7 +203,7 @@ LIMITED = ("speed", "steering", "acceleration", "steering_rate")
 
 
 LAG = 0.1
-"""s for the period of the gate and the lags of a car."""
+"""Allowance (s) for the period of the gate and the lags of a car."""
 ROLLING = 1.0
 """Deceleration of a car that is not braked, unless it is measured, m/s^2."""
 
@@ -230,7 +230,7 @@ class Safety(Section):
     separation: float = Field(default=0.0, ge=0.0, le=100.0)
     """Least distance between a driven car and any other car of the fleet, m (0: not watched)."""
     deceleration: float | None = Field(default=None, ge=0.1, le=20.0)
-    """Of a car that is stopped, m/s^2, by a test (default: of the profile's brake, or 1). Cars are stopped in time to
+    """Deceleration of a stopping car, m/s^2, by a test (default: the profile's brake, or 1). Cars stop early enough to
     stand inside the geofence, apart."""
     judge: Literal["truth", "estimate"] = "truth"
     """Source of the positions for geofence and separation."""

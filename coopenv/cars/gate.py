@@ -131,7 +131,7 @@ def write_status(
 
 
 class GateMode(StrEnum):
-    """Of the gate."""
+    """Mode of the gate."""
 
     DISARMED = "disarmed"
     ARMED = "armed"

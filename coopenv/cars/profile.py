@@ -216,7 +216,7 @@ class Brake(Section):
     fields: dict[str, Number] = Field(min_length=1)
     """Fields of the message that differ from a standing car's."""
     deceleration: Positive
-    """Of a braking car, m/s^2, by a test. Braking ends when the last commanded speed is used up at it."""
+    """Deceleration of a braking car, m/s^2, by a test. Braking lasts for the last commanded speed divided by it."""
 
 
 FieldType = Literal["bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"]
@@ -243,9 +243,9 @@ class CommandMessage(Section):
     most: float = Field(default=1.0, gt=0.0, le=1.0)
     """Share of full that is sent at most, either way."""
     brake: Brake | None = None
-    """With it a gate that stops its car brakes first (none: a stop is neutral alone)."""
+    """Braking before neutral when the gate stops its car (none: neutral alone)."""
     wheelbase: Positive | None = None
-    """Of a car that takes turn rates, as those with a differential drive do: that of the environment's vehicle, m.
+    """Wheelbase of a car that takes turn rates, such as differential drives: that of the environment's vehicle, m.
     Turn rates are speed tan(steering) / wheelbase."""
     timeout: Positive = 0.5
     """Time without a message after which the car goes to neutral by itself, s (assumed by fake cars)."""

@@ -186,7 +186,7 @@ FINDERS: dict[str, Find] = {
     "svea_thesis/msg/ArucoArray": _markers,
     "svea_msgs/msg/ArucoArray": _markers,
 }
-"""By the type of the message."""
+"""Decoders by the type of the message."""
 
 
 @cache

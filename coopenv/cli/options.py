@@ -164,7 +164,7 @@ def dotted_keys(annotation: Any) -> Iterator[str]:
 
 
 MOST_WORLDS = 1_000_000
-"""Of a command that drives them all at once."""
+"""Most worlds of a command that drives them all at once."""
 
 FigureFormat = StrEnum("FigureFormat", "png pdf svg")
 FigureColumn = StrEnum("FigureColumn", "ieee1 ieee2 springer1 springer2")

@@ -21,13 +21,13 @@ COEFFICIENTS = {
     len(PLUMB_BOB): PLUMB_BOB,
     8: (*PLUMB_BOB, "k4", "k5", "k6"),
 }
-"""Their names by their number."""
+"""Names of a lens's coefficients, by their number."""
 
 SQUARE = Polynomial([0.0, 1.0])
 """The squared radius."""
 
 CLOSE = 1e-9
-"""Of image coordinates at distance 1: how near a ray's image has to be to the point that it was found for."""
+"""Tolerance between a ray's image and its point, in image coordinates at distance 1."""
 
 
 def distort(points: Array, distortion: tuple[float, ...]) -> Array:

@@ -51,7 +51,7 @@ from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.correction import InnovationGate, Stacked, gain, joseph
 
 Masks = dict[int, NDArray[np.bool_]]
-"""Of the targets of vehicles that saw any."""
+"""Masks of the visible targets, by vehicle that saw any."""
 
 
 class Centralised:

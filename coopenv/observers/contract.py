@@ -35,7 +35,7 @@ class SensorNoise:
     image_axis: tuple[float, float, float] | None = None
     """Axis of that image plane, unit vector in the body frame; None: the noise is in the tangent plane."""
     odometry_scale: float = 0.0
-    """Of the lasting errors, see `[noise]` and `[camera]` of a scenario; walks are per square root of a second."""
+    """From here on lasting errors, standard deviations, see `[noise]` and `[camera]`; walks per square root of s."""
     odometry_scale_walk: float = 0.0  # per square root of a second
     gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)  # rad/s, body axes
     gyro_bias_walk: tuple[float, float, float] = (0.0, 0.0, 0.0)  # rad/s per square root of a second, body axes

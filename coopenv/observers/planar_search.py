@@ -88,7 +88,7 @@ class Sighting(NamedTuple):
 
 
 class SightingLines(NamedTuple):
-    """m sightings, seen from where the robot is now: offset (m, 2) in m in its body, and so on, all (m,)."""
+    """Lines of m sightings relative to the robot's current pose: offset (m, 2) in m, body frame; others (m,)."""
 
     offset: Array
     angle: Array  # rad, from the robot's present heading, or in the map
@@ -106,7 +106,7 @@ class SightingHistory:
         self._trail = np.zeros(5)
         """Odometry pose: x m, y m, heading rad; and the sums of its variances, rad^2 and m^2."""
         self._seen: deque[tuple[Sighting, Array]] = deque(maxlen=MOST)
-        """With the trail at that time."""
+        """Sightings with the trail at their time."""
 
     def forget(self, before: float) -> None:
         """Forget the sightings before a time in s."""

@@ -68,7 +68,7 @@ ZOO = {
     "smoother": ZooEntry("smoother:Smoother", on_a_plane=False),
     "fixed_lag_smoother": ZooEntry("smoother:FixedLagSmoother", on_a_plane=False),
 }
-"""By name."""
+"""Observers of coopenv, by name."""
 
 
 GROUP = "coopenv.observers"

@@ -86,4 +86,4 @@ def played_back(actions: np.ndarray) -> Policy:
 
 
 PLAIN: dict[str, Callable[[int, int], Policy]] = {"zero": zero_policy, "random": random_policy}
-"""By name, made from a seed and the length of an action."""
+"""Policies by name, made from a seed and the length of an action."""

@@ -27,7 +27,7 @@ AGENT_FILE = "agent.toml"
 CARD_FILES = ("card.json", "card.md")  # written beside it by `coopenv evaluate --write-card`
 CHECKPOINT_FILE = "checkpoint.safetensors"  # in its place while an agent is trained
 LATER_FIELDS = {"center", "settings"}
-"""Of a learned agent's tables: what the first versions did not write, and cannot be guessed."""
+"""Fields of a learned agent's tables that the first versions did not write, without a default."""
 
 
 class NetworkColumn(Section):
@@ -48,7 +48,7 @@ class NetworkCard(Section):
     weights: str
     """File in the agent's folder."""
     sha256: str
-    """Of the file."""
+    """SHA-256 of the file."""
     layout: str
     """`layout_hash` of the three tables below."""
     clip: PositiveFloat
@@ -56,7 +56,7 @@ class NetworkCard(Section):
     observation: dict[str, NetworkColumn]
     action: dict[str, NetworkColumn]
     settings: dict[str, float]
-    """Of the scenario, by dotted key: those that say what the entries mean beside these tables."""
+    """Settings of the scenario, by dotted key, that define the meaning of the entries beside these tables."""
     seen: dict[str, tuple[float, float]] = Field(default={})
     """Between which values nearly all entries of a field lay in training, by its name."""
 
@@ -75,7 +75,7 @@ class AgentCard(Section):
     options: dict[str, Any] = Field(default={})
     """Keyword arguments of the entry."""
     network: NetworkCard | None = None
-    """Of a learned one: its weights, and the observation and action that it was trained with."""
+    """Network of a learned agent: weights, and observation and action of the training."""
     training: dict[str, Any] = Field(default={})
     """Command, seed and versions of the training."""
     results: dict[str, Any] = Field(default={})
@@ -92,9 +92,9 @@ class Agent(AgentCard):
     name: str
     """Name of the agent in tables."""
     title: str = ""
-    """Of its card."""
+    """Title of its card."""
     description: str = ""
-    """Of its card."""
+    """Description of its card."""
     environments: tuple[str, ...] = ()
     """Environments of its card, with absolute paths."""
     code: Any = None

@@ -11,7 +11,7 @@ from coopenv.policies.prediction import at_arc_lengths, discs_along, nearest, ri
 from coopenv.scenario import Scenario
 
 MULTIPLES = np.array([1.0, 2.0, 4.0, 8.0])
-"""Of `observation.route_step`: how far ahead the entries of `route_ahead` are."""
+"""Distances ahead of the entries of `route_ahead`, as multiples of `observation.route_step`."""
 
 SMALL = (0.586, 0.25)
 """Length and width, m, of the car that distances are chosen for (SVEA); they grow with larger ones."""
@@ -142,8 +142,8 @@ LEAP = 2.0
 """m, by which a car's reported place changes at most by corrections. Where landmarks are rare, 1.5 costs arrivals."""
 
 PATIENCE, STANDING = 3.0, 0.5
-"""s for which a car waits that is slower than this, m/s, before it takes others to go on as they do now, until it
-drives at half of its top speed."""
+"""Waiting time (s) below a speed (m/s), after which a car expects other vehicles to keep their motion, until it drives
+at half of its top speed."""
 
 LEAST_MOVED = 0.2
 """m, that a car has driven at least before the curvature of its way is measured in full."""
@@ -193,9 +193,9 @@ class RouteFollower(Driver):
         """Time (s) ahead in which other vehicles count."""
         self.period = 1.0 / scenario.rates.decision
         self._last = (np.zeros((0, 0), dtype=bool), *(np.zeros((0, 0, 0)) for _ in range(4)), np.zeros(0))
-        """Of the last decision: messages, places, directions, ages and motions of their senders, and s of standing."""
+        """Last decision: messages, positions, directions, ages and motions of senders; standing time, s."""
         self._reported = (np.zeros((0, 0), dtype=bool), *(np.zeros((0, 0, 0)) for _ in range(3)))
-        """Of the last decision: senders, their places, how old these are, and how far they have leapt."""
+        """Reports of the last decision: senders, their positions, ages (s) and jumps (m)."""
         self.paces = (1.0,) if nimble else (0.0, 0.25, 0.5, 0.75, 1.0)
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:

@@ -69,7 +69,7 @@ class Manifest(Section):
     kernels: dict[str, str]
     """Hashes of the modules of kernels, by name."""
     state_tick: Count
-    """Of the state that is kept."""
+    """Tick of the saved state."""
     end: RunEnd
     parts: dict[str, str]
     """Digests of the other parts, by name."""

@@ -52,7 +52,7 @@ class Progress:
         self._first: tuple[float, float] | None = None
         """Time (s) and amount of the first parts, which compiling may have slowed down."""
         self._burst = inf
-        """Until when parts count as first ones, s: processes side by side finish theirs together."""
+        """End (s) of the time in which parts count as first ones: parallel processes finish theirs together."""
         self._over = threading.Event()
         columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
         self._bar = Bar(*columns, console=log, transient=True)

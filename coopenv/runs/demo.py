@@ -159,7 +159,7 @@ class Demo:
     deployment: Path | None = None
     """One's own deployment file, whose cars are fakes; `environment` is its environment then."""
     time: float = field(default=0.0, init=False)
-    """s driven."""
+    """Driven time, s."""
     decisions: int = field(default=0, init=False)
     missed: int = field(default=0, init=False)
     delays: list[float] = field(default_factory=list, init=False)
@@ -167,7 +167,7 @@ class Demo:
 
     @property
     def fleet(self) -> Path:
-        """Its deployment file. Raises CoopenvError: the environment has none."""
+        """Deployment file of the demo. Raises CoopenvError: the environment has none."""
         if self.deployment is not None:
             return self.deployment
         check_one_of("--environment: no fleet of fakes for", self.environment, FLEETS)

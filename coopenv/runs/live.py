@@ -27,7 +27,7 @@ from coopenv.viz.web_panel import Abilities
 LEAVE, AGAIN = {"escape", "q"}, {"r"}
 HELP = "Arrow keys: faster, slower, left, right. r: again. Escape: leave."
 FULL_SPEED, FULL_STEERING = 1.0, 0.4
-"""s that a key is held for the whole range: from standstill to top speed, from straight ahead to full steering."""
+"""Time (s) of holding a key for the whole range: from standstill to top speed, from straight ahead to full steering."""
 
 
 class Keys:
@@ -322,4 +322,4 @@ FAULTS: dict[str, Callable[[float, int], dict[str, Any]]] = {
     "half of the messages lost, whole episode": lambda time, vehicle: {"v2x.loss": 0.5},
     "half of the detections missed, whole episode": lambda time, vehicle: {"camera.miss_probability": 0.5},
 }
-"""By name: what is changed of the scenario, for a time in s and a vehicle."""
+"""Changes of the scenario by the name of a fault, for a time in s and a vehicle."""

@@ -191,7 +191,7 @@ def drive_vehicles(
 
 
 FILES = ("main_data.hdf5", "metadata.json")
-"""Of a dataset, in its folder `data`."""
+"""Files of a dataset, in its folder `data`."""
 PER_EPISODE = 1 << 16
 """Bytes that an episode takes at most besides its arrays."""
 

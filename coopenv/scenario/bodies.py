@@ -99,7 +99,7 @@ class Waypoint(Section):
     time: NonNegative
     """s"""
     position: Vector3
-    """In the coordinates of this file, m."""
+    """Position in the coordinates of this file, m."""
 
 
 class WaypointMotion(Section):
@@ -165,7 +165,7 @@ class InitialPose(Section):
     """Start of an agent, fixed or drawn anew at each reset; an agent with routes starts on the drawn route."""
 
     position: Vector3 | None = None
-    """In the coordinates of this file, m; needed without routes."""
+    """Position in the coordinates of this file, m; needed without routes."""
     yaw: Number | None = None
     """Rotation about z, rad (0 when neither yaw nor a quaternion is given)."""
     quaternion_wxyz: QuaternionWxyz | None = None
@@ -210,7 +210,7 @@ class Goal(Section):
     """Goal of a driven vehicle. With routes, the goal is the end of the drawn route."""
 
     position: Vector3 | None = None
-    """In the coordinates of this file, m; needed without routes."""
+    """Position in the coordinates of this file, m; needed without routes."""
     radius: Positive = 0.5
     """The vehicle has arrived within this horizontal distance, m."""
 
@@ -308,7 +308,7 @@ class Area(Section):
     """A rectangle whose sides are parallel to the axes."""
 
     center: Vector2
-    """In the coordinates of this file, m."""
+    """Centre in the coordinates of this file, m."""
     half: PositiveVector2
     """Half of its sides along x and y, m."""
 
@@ -318,7 +318,7 @@ class Line(Section):
 
     start: Vector2
     end: Vector2
-    """In the coordinates of this file, m."""
+    """End in the coordinates of this file, m."""
 
 
 class LandmarkGroup(Section):

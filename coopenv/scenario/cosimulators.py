@@ -55,9 +55,9 @@ class Highway(Cosimulator):
     reference_midway = True
 
     id: Annotated[str, Field(max_length=64, pattern=r"^[a-z0-9][A-Za-z0-9-]*-v\d+$")]
-    """Its id in Gymnasium's registry, such as `intersection-v0`."""
+    """Id in Gymnasium's registry, such as `intersection-v0`."""
     config: dict[str, Setting] = Field(default={})
-    """Its own configuration by key; settings of this file (rates, sizes of actions) are not repeated here."""
+    """Configuration of the environment by key; this file's settings (rates, sizes of actions) are not repeated here."""
     dynamical: bool = False
     """Give driven vehicles tyres that slip (highway-env's BicycleVehicle); otherwise its kinematic bicycle."""
 
@@ -112,7 +112,7 @@ class Program(Cosimulator):
 
 
 COSIMULATORS: Mapping[str, type[Cosimulator]] = {"highway": Highway, "sumo": Sumo, "program": Program}
-"""By their names in `backend`, which are fields of `Scenario`."""
+"""Co-simulators by their names in `backend`, which are fields of `Scenario`."""
 
 
 FILES: Mapping[str, tuple[str, ...]] = {"sumo": ("net", "routes", "additional"), "program": ("code",)}
@@ -122,7 +122,7 @@ FILES: Mapping[str, tuple[str, ...]] = {"sumo": ("net", "routes", "additional"),
 LANE_WIDTH = 3.2
 """m, of lanes that state none."""
 SIDE = 0.5
-"""m from the edge of a road to the post beside it."""
+"""Distance (m) from the edge of a road to the post beside it."""
 WALL = 0.1
 """m, thickness of the walls of a building that is no rectangle."""
 RECTANGULAR = 0.99

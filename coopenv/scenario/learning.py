@@ -159,11 +159,11 @@ class Reward(Section):
 
     weights: RewardWeights = RewardWeights()
     team: Literal["own", "mean", "min"] = "own"
-    """Whose weighted sum a driven vehicle is rewarded for: its own, or the mean or the least of all driven vehicles.
-    For the latter two an episode goes on, without actions, until it is over for all of them; the mean is over all that
-    are there, the least over those under way."""
+    """Reward of a driven vehicle: its own weighted sum, or the mean or the least of all driven vehicles. With `mean`
+    and `min`, an episode continues, without actions, until it is over for all of them; the mean is over all present
+    vehicles, the least over the vehicles under way."""
     own_share: Probability = 0.0
-    """With a team: the share of a vehicle's own weighted sum in its reward; the rest of it is the team's."""
+    """Share of a vehicle's own weighted sum in its reward with a team; the rest is the team's."""
     uncertainty_threshold: NonNegative = 0.02
     """m; terms per metre count what is above it"""
     uncertainty_cap: Positive = 1.0

@@ -77,7 +77,7 @@ class Route(Section):
 
     @cached_property
     def shape(self) -> Shape:
-        """Its straight lines and turns."""
+        """Straight lines and turns of the route."""
         leg = np.diff(np.array(self.waypoints), axis=0)
         heading = np.arctan2(leg[:, 1], leg[:, 0])
         turn = np.zeros(len(self.waypoints))
@@ -182,7 +182,7 @@ def followers(vehicle: Vehicle, routes: Sequence[Route]) -> list[list[int]]:
 
 
 SPLINE_STEP = 0.02
-"""s between the poses at which a waypoint spline is met exactly ..."""
+"""Period (s) of the poses at which a waypoint spline is met exactly ..."""
 MOST_ROWS = 200
 """... but at most so many from one waypoint to the next, so that the table grows with the waypoints and not with time.
 From pose to pose the path is an arc, which strays from the cubic by less than half of its length."""

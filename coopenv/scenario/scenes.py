@@ -82,7 +82,7 @@ def ring(vehicles: int, seen: int) -> Iterator[PlacedVehicle]:
 
 
 MOST_VEHICLES, MOST_SENSED = 4096, 64
-"""Of scenes whose neighbours are listed, and of the others."""
+"""Most vehicles of scenes with listed neighbours, and of other scenes."""
 
 
 class Option(NamedTuple):
@@ -149,7 +149,7 @@ SCENES: Mapping[str, Scene] = {
         {"vehicles": Option(2, MOST_SENSED, 8), "speed": Option(1, 50, 10.0)},
     ),
 }
-"""By name."""
+"""Scenes by name."""
 
 
 def scene_rows() -> list[dict[str, str]]:

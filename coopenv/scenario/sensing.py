@@ -177,12 +177,12 @@ class Noise(Section):
     odometry_scale: NonNegative = 0.0
     """Standard deviation of a scale error s, drawn per vehicle and episode: measured is (1 + s) times the velocity."""
     odometry_scale_walk: NonNegative = 0.0
-    """It walks on by this standard deviation per square root of a second."""
+    """Random walk of the scale, standard deviation per square root of a second."""
     gyro_bias: PerAxis = 0.0
     """Standard deviation of a bias of the measured angular velocity, drawn per vehicle and episode, rad/s: of each
     component, or of the three body axes ([0, 0, x]: a car whose roll and pitch rates an accelerometer corrects)."""
     gyro_bias_walk: PerAxis = 0.0
-    """It walks on by this standard deviation, rad/s per square root of a second."""
+    """Random walk of the bias, standard deviation, rad/s per square root of a second."""
     slip: Slip = Slip()
 
     @property
@@ -209,8 +209,8 @@ class V2x(Section):
     """The radio that carries pose estimates between vehicles."""
 
     links: Literal["neighbours", "all"] = "neighbours"
-    """Whose messages a vehicle receives: those of the vehicles that it may measure, or of all in range. Its estimator
-    uses the former alone; its driver all, for the right of way."""
+    """Senders that a vehicle receives: the vehicles that it may measure, or all in range. Its estimator uses the former
+    alone; its driver all, for the right of way."""
     delay: int = Field(default=0, ge=0, le=600)
     """Camera ticks from sending to receiving; 0: a leader's estimate of the same tick."""
     period: int = Field(default=1, ge=1, le=100_000)
@@ -242,7 +242,7 @@ class ObserverSettings(Section):
     gramian_window: float = Field(default=1.0, gt=0.0, le=3600.0)
     """Length of the sliding window of the observability Gramian, s."""
     gramian_distance: Positive | None = None
-    """Its length in m driven forwards by odometry, in place of a time (none)."""
+    """Length of the window in m driven forwards by odometry, in place of a time (none)."""
 
     @model_validator(mode="after")
     def _gain_is_stable(self) -> Self:
@@ -264,16 +264,16 @@ class Restart(Section):
     time: NonNegative = 0.0
     """When, s; it takes place at the next decision, never in the first one."""
     time_spread: NonNegative = 0.0
-    """So much later at most, drawn uniformly, s."""
+    """Largest delay of the time, drawn uniformly, s."""
 
 
 class Corruption(Section):
     """Messages whose pose is altered on the way, so that they can still be read. What cannot is lost: `v2x.loss`."""
 
     probability: Probability = 0.0
-    """Of each message, for all that receive it."""
+    """Probability of each message, for all its receivers."""
     start: NonNegative = 0.0
-    """From when on, s."""
+    """Time of the start, s."""
     size: NonNegative = 10.0
     """Largest deviation of each coordinate of the position, m."""
     turn: NonNegative = 1.0
@@ -289,21 +289,21 @@ class Lie(Section):
     chance: Probability = 1.0
     """Probability that the vehicle lies in an episode; drawn once for all colluding vehicles."""
     start: NonNegative = 0.0
-    """From when on, s."""
+    """Time of the start, s."""
     start_spread: NonNegative = 0.0
-    """So much later at most, drawn uniformly (once for all that collude), s."""
+    """Largest delay of the start, drawn uniformly (once for all colluding vehicles), s."""
     offset: NonNegative = 5.0
-    """Of `jump` and `collude`, m."""
+    """Offset of `jump` and `collude`, m."""
     turn: NonNegative = 0.0
-    """Of all but `replay`: about its own z axis, added to its attitude, rad."""
+    """Turn of all kinds but `replay`: about the vehicle's z axis, added to its attitude, rad."""
     odometry: Literal["consistent", "honest"] = "consistent"
     """Odometry in its messages, if any: `consistent` with the lie, or `honest`, the vehicle's own."""
     speed: Positive = 0.05
-    """Of `drift`, m/s."""
+    """Speed of `drift`, m/s."""
     age: Annotated[float, Field(gt=0.0, le=LONGEST_REPLAY)] = 1.0
-    """Of `replay`, s; rounded to whole periods of the radio."""
+    """Age of the messages of `replay`, s; rounded to whole periods of the radio."""
     direction: Direction | None = None
-    """Of what is added to the position, map axes, of any length (default: horizontal, drawn)."""
+    """Direction of the offset of the position, map axes, of any length (default: horizontal, drawn)."""
     std: Positive | None = None
     """Claimed standard deviation of its pose, rad and m (default: its honest covariance)."""
 
@@ -316,15 +316,15 @@ class MapError(Section):
     landmark: str | None = Field(default=None, max_length=64)
     """Name of the landmark (default: any may be wrong)."""
     offset: NonNegative = 1.0
-    """Of the place on the map from the true one, m."""
+    """Distance of the position on the map from the true one, m."""
     offset_spread: NonNegative = 0.0
-    """So much more at most, drawn uniformly, m."""
+    """Largest increase of the offset, drawn uniformly, m."""
     direction: Direction | None = None
-    """Of the offset, map axes, of any length (default: horizontal, drawn per landmark)."""
+    """Direction of the offset, map axes, of any length (default: horizontal, drawn per landmark)."""
     start: NonNegative = 0.0
-    """From when on, s; the place is right before."""
+    """Time of the start, s; the position is right before it."""
     start_spread: NonNegative = 0.0
-    """So much later at most, drawn uniformly per landmark, s."""
+    """Largest delay of the start, drawn uniformly per landmark, s."""
 
 
 class Jammer(Section):
@@ -333,17 +333,17 @@ class Jammer(Section):
     chance: Probability = 0.0
     """Probability that the vehicle has a jammer in an episode."""
     range: Positive | None = None
-    """m (none: unlimited)."""
+    """Range, m (none: unlimited)."""
     position: Vector3 | None = None
     """Fixed place of the jammer, m (default: it moves with the vehicle)."""
     start: NonNegative = 0.0
-    """From when on, s."""
+    """Time of the start, s."""
     start_spread: NonNegative = 0.0
-    """So much later at most, drawn uniformly, s."""
+    """Largest delay of the start, drawn uniformly, s."""
     duration: Positive | None = None
-    """s (none: to the end)."""
+    """Duration, s (none: to the end)."""
     period: Positive = 1.0
-    """Of a periodic jammer, s."""
+    """Period of a periodic jammer, s."""
     duty: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
     """Share of each period in which it jams, from the period's start on; 1: a constant jammer."""
 

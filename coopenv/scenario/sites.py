@@ -54,11 +54,11 @@ class Site(NamedTuple):
     landmarks: Mapping[str, Point] = LANDMARKS
     buildings: Sequence[Building] = ()
     roads: Sequence[tuple[tuple[float, float], tuple[float, float]]] = ()
-    """Both ends of each, m."""
+    """Both ends of each road, m."""
     range: float | None = None
-    """Of the cameras, m."""
+    """Range of the cameras, m."""
     origin: tuple[float, float] = (0.0, 0.0)
-    """Of the map, m."""
+    """Origin of the map, m."""
 
 
 HORIZON = 50.0
@@ -70,13 +70,13 @@ LANE = 3.5
 CAR, VAN = (4.5, 1.8, 1.5), (5.5, 2.0, 2.6)
 """Length, width and height, m; every third vehicle is a van."""
 HEADWAY, STANDSTILL = 1.5, 8.0
-"""s and m: vehicles of a lane are STANDSTILL + HEADWAY * speed apart, from centre to centre."""
+"""Headway, s, and distance at standstill, m: centres of vehicles in a lane are STANDSTILL + HEADWAY * speed apart."""
 OVERTAKING = 1.1
 """Ratio of the speeds of the left and the right lane."""
 POSTS, BRIDGES = 100.0, 4
-"""m from one post to the next, which are on alternate sides, and posts from one sign bridge to the next."""
+"""Distance (m) between posts, which are on alternate sides, and number of posts between sign bridges."""
 SIGNS, CORNER = 80.0, (8.0, 68.0)
-"""m from one street sign to the next, and m from the axes to the near and the far side of a building at a corner."""
+"""Distance (m) between street signs, and from the axes to the near and the far side of a corner building."""
 ARRIVAL = 10.0
 """s, after which the first two vehicles are in the middle of the crossing."""
 CLEARANCE = (1.0, 12.0)
@@ -155,7 +155,7 @@ TURNS = ("straight", "right")
 CORNER_RADIUS = 6.0
 """m, of right turns."""
 FACADE = 0.1
-"""m from a building's wall to the signs on it."""
+"""Distance (m) of a sign from its building's wall."""
 STARTS = 2
 """Streets in a row, in one of which a vehicle without `routes` of its own starts."""
 
@@ -177,19 +177,19 @@ class Streets(Section):
     lane: Annotated[float, Field(ge=2.5, le=5.0)] = 3.5
     """Width of a lane, m."""
     pavement: Annotated[float, Field(ge=0.5, le=6.0)] = 3.0
-    """From a street to the buildings, m."""
+    """Distance from a street to the buildings, m."""
     height: Positive = 12.0
-    """Of the buildings, m."""
+    """Height of the buildings, m."""
     signs: Annotated[int, Field(ge=1, le=1000)] = 4
     """Landmarks per block, drawn along its facades."""
     sign_height: PositiveVector2 = (2.0, 5.0)
     """Lowest and highest z, m."""
     period: Positive = 28.0
-    """Of the signals, s."""
+    """Period of the signals, s."""
     clearance: NonNegative = 4.0
-    """From one green time to the next, s."""
+    """Time between green phases, s."""
     lateral_spread: NonNegative = 0.2
-    """Of the routes, m."""
+    """Lateral spread of the routes, m."""
 
     @model_validator(mode="after")
     def _is_possible(self) -> Self:

@@ -18,7 +18,7 @@ LOG_SCALE = 10.0
 """Decades (or nepers of log det P / 6) that fill the range of a logarithmic entry."""
 
 COLUMNS = ("per", "size", "unit", "scale", "low", "meaning", "planar", "center")
-"""Of a field; the last two, which entries a vehicle on a plane needs and what reads 0, only where they are unusual."""
+"""Columns of a field; the last two only if unusual: entries for a vehicle on a plane, and the value read as 0."""
 XY = (0, 1)
 FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
     "estimate": [
@@ -238,7 +238,7 @@ R = TypeVar("R", bound=TermRow)
 
 
 class Registry(Generic[R]):
-    """All terms of one kind: those of coopenv and those registered in this program."""
+    """All terms of one kind: built-in terms and terms registered in this program."""
 
     def __init__(self, kind: str, built_in: Mapping[str, R]) -> None:
         self.kind, self.built_in = kind, built_in

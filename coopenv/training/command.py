@@ -218,10 +218,10 @@ class Checkpoint(BaseModel):
     onnx: bool = False
     """Write an ONNX model, too, as on the command line."""
     logs: Path | None = None
-    """Its folder for TensorBoard; None: in the agent's folder."""
+    """Folder for TensorBoard; None: in the agent's folder."""
     path: Path = Field(default=Path(), exclude=True)
     arrays: dict[str, dict[str, Any]] = Field(default={}, exclude=True, repr=False)
-    """By what they restore, and by name."""
+    """Arrays by the object that they restore, and by name."""
 
 
 def save(

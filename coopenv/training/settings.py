@@ -98,14 +98,14 @@ class Clone(Section):
     noise: NonNegative = 0.1
     """Standard deviation of noise added to the agent's actions, so that corrections are recorded, too."""
     elsewhere: tuple[str, ...] | None = None
-    """With a network over sets: environments where it is watched in place of the trained one, which is left out."""
+    """Environments of the demonstrations for a network over sets, in place of the trained one, which is left out."""
 
 
 class Variation(Section):
     """Worlds to learn in that differ from the others."""
 
     share: Annotated[float, Field(gt=0.0, le=1.0)]
-    """Of the worlds; one at least."""
+    """Share of the worlds; at least one world."""
     scenario: dict[str, Any]
     """Overrides that go before all others."""
 
@@ -313,9 +313,9 @@ class EnvironmentFile(NamedTuple):
     """The environment as an agent's folder holds it."""
 
     title: str
-    """Its name in texts."""
+    """Name of the environment in texts."""
     name: str
-    """By which `agent.toml` names it: one of coopenv's, or a file beside `agent.toml`."""
+    """Name in `agent.toml`: an environment of coopenv, or a file beside `agent.toml`."""
     text: str | None = None
     """Contents of that file."""
     code: Mapping[str, Path] = {}

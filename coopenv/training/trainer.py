@@ -40,7 +40,7 @@ class Status:
     """Decisions of vehicles so far."""
     seconds: float
     share: float
-    """Of the budget, 0 to 1."""
+    """Share of the budget, 0 to 1."""
     figures: dict[str, float]
     """`return`, `arrival_rate` and `collision_rate` over the last episodes; `e50_m` and `e95_m` in the last rollout."""
 
@@ -171,7 +171,7 @@ class NormalisedEnv(VecEnvWrapper):
         self.statistics = RunningMeanStd(shape=shape or ())
         self._clip, self._scale, self._gamma = ppo.observation_clip, ppo.reward_scale, ppo.gamma
         self.spread = RunningMeanStd(shape=())
-        """Of discounted returns, in the units of the scenario."""
+        """Running mean and variance of discounted returns, in the units of the scenario."""
         self.returns = np.zeros(venv.num_envs)
         self.looked_at: deque[np.ndarray] = deque(maxlen=SEEN)
         self._present: np.ndarray | None = None
@@ -196,7 +196,7 @@ class NormalisedEnv(VecEnvWrapper):
 
     @property
     def reward_scale(self) -> float:
-        """By which rewards are multiplied now."""
+        """Current factor of the rewards."""
         return float(1.0 / np.sqrt(self.spread.var + 1e-8)) if self._scale == "spread" else self._scale
 
     def seen(self, columns: slice) -> tuple[float, float]:

@@ -159,7 +159,7 @@ class Column(NamedTuple):
     size: float
     """pt, of labels; ticks and legends are a sixth smaller."""
     fonts: tuple[str, ...]
-    """By preference; Matplotlib brings the last one."""
+    """Fonts by preference; Matplotlib ships the last one."""
     mathematics: str
     """Matplotlib's set of fonts for formulas."""
 

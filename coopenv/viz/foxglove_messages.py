@@ -89,7 +89,7 @@ class RunView:
         s = r.scenario
         sensed = s is not None and s.topology.mode == "sensed"
         self.cameras = {i: c for i, c in enumerate(s.cameras) if c.model == "pinhole"} if s and sensed else {}
-        """By index of the vehicles that have an image."""
+        """Cameras with an image, by index of the vehicle."""
 
     def stamp(self, tick: int) -> Any:
         """Return the time of a tick as a `foxglove.Timestamp`."""

@@ -16,7 +16,7 @@ from coopenv.viz.style import linear_light, rgb
 SKY, HORIZON, GRASS, GRID = "#6FA8DC", "#DCEBF7", "#8DAA74", "#9CB785"
 ASPHALT, MARKS, WALL, DARK = "#54585D", "#F2F2F2", "#D8C9AE", "#1B2026"
 DOT = 0.008
-"""Of the scene's side, radius of a landmark."""
+"""Radius of a landmark as a share of the scene's side."""
 FAR = 2.0
 """Scene's sides from its middle: estimates farther away are drawn there."""
 SUN = np.array([-0.45, -0.6, 0.85])
@@ -110,7 +110,7 @@ class Look:
     """Choices of whoever looks, and measures that follow from the scene's size."""
 
     magnification: float = 1.0
-    """Of the ellipsoids."""
+    """Magnification of the ellipsoids."""
     ellipsoids: bool = True
     estimates: bool = True
     sight: bool = True
@@ -266,7 +266,7 @@ class Ground:
         self._scene, self._stage = scene, stage
         self.z = stage.floor
         self.step = 2.0 ** np.floor(np.log2(stage.side * 1e-4))
-        """Of positions, m."""
+        """Resolution of positions, m."""
         self.root = scene.add_frame(ROOT, show_axes=False)
         """viser's handle of the node that everything hangs on."""
         scene.configure_environment_map(None)

@@ -164,7 +164,7 @@ def _draw_targets(draw: ImageDraw.ImageDraw, stage: Stage, frame: Frame, vehicle
 
 
 CAMERAS = ("overview", "follow", "driver")
-"""From above the scene; behind a vehicle; through a vehicle's camera."""
+"""Views from above the scene, from behind a vehicle, and through a vehicle's camera."""
 _SOUTH = np.array([0.0, -0.6, 0.8])  # direction from the middle to the camera that sees everything
 _ANGLE, _AWAY = 40.0, 1.35  # its vertical field of view, deg, and its distance in the scene's sides
 _SHORTEST = 0.07  # of the scene's side, length of a vehicle in its picture

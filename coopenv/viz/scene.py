@@ -129,7 +129,7 @@ class Frame:
 
 
 FIELDS: dict[str, str] = {name: kind.__metadata__[0] for name, kind in get_annotations(Frame).items()}
-"""By field of a frame its kind and axes."""
+"""Kind and axes of each field of a frame."""
 _WHOLE = frozenset(name for name, rule in FIELDS.items() if rule.startswith("i"))
 
 
@@ -141,7 +141,7 @@ class Origin(Section):
     """Environment, observer, driver and seed of a scene, for its heading."""
 
     name: str
-    """Of the environment, the recording or the deployment."""
+    """Name of the environment, the recording or the deployment."""
     observer: str
     policy: str = ""
     """Name of the driver; empty: no driver."""
@@ -182,7 +182,7 @@ class SceneRecord:
     scenario: Scenario
     source: Origin
     fields: dict[str, np.ndarray]
-    """By name of a frame's field, (K, ...)."""
+    """Arrays (K, ...) by the name of a frame's field."""
 
     def __len__(self) -> int:
         """Return K."""

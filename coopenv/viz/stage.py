@@ -20,7 +20,7 @@ from coopenv.viz.scene import Frame, semi_axes
 
 _CIRCLE = np.linspace(0.0, 2 * np.pi, 97)
 CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-"""Of a square about the origin, in turn."""
+"""Corners of a square about the origin, in order."""
 _FAN_RAYS = 65
 _PATH_SAMPLES = 121
 _UNKNOWN = ("static", "driven", "traffic")  # motions that say nothing of a way

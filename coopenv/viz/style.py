@@ -361,7 +361,7 @@ def place_names(
 
 Colour = str | tuple[float, float, float]
 LEAST = 4.5
-"""Of text, as WCAG 2 asks for at level AA."""
+"""Least contrast of text, as WCAG 2 requires at level AA."""
 
 
 def linear_light(part: np.ndarray) -> np.ndarray:

@@ -110,7 +110,7 @@ NONE_PICKED = "none"
 _PICK = "*Pick a vehicle above, or click on one in the scene.*"
 NO_FAULT = "none"
 TIME_EVERY, TEXTS_EVERY, PLOTS_EVERY = 0.1, 0.25, 0.5
-"""s of real time between two positions of the slider, two tables, and two images and plots."""
+"""Periods (s of real time) of the slider, of tables, and of images and plots."""
 
 
 @dataclass

@@ -210,7 +210,7 @@ class Trails:
 
 
 FLIGHT, PAUSE = 0.5, 1.0
-"""s of the scene's time: how long a bead flies, and the least time between two of a link."""
+"""Flight time of a bead, and least time between two beads of a link, s of the scene's time."""
 _SIZE = 0.006  # of the scene's side
 
 

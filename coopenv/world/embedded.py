@@ -81,7 +81,7 @@ class Embedded:
     """
 
     name: str
-    """By which scenarios and tables call it."""
+    """Name in scenarios and tables."""
     estimate: Any
     """(model, state, memory, world, vehicle, now): take one camera tick `Now`; messages have been delivered. Or several
     functions, in turn (`parts`): on a GPU each is a kernel of its own, which keeps nothing else than its records."""
@@ -103,9 +103,9 @@ class Embedded:
     """Rules for a saved memory, by field. Without a rule, floats must be finite and integers are unrestricted: give
     every index and count a rule."""
     messages: Messages | None = None
-    """Its messages on the host; None: it sends the V2X pose estimate alone."""
+    """Messages on the host; None: it sends the V2X pose estimate alone."""
     coordinates: Coordinates = Coordinates.RICCATI
-    """In which it states its covariance on the host; in the state it is over (2 lambda, p)."""
+    """Coordinates of its covariance on the host; in the state they are (2 lambda, p)."""
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """Options of the Warp module that it is compiled in."""
     fused: bool = False
@@ -168,7 +168,7 @@ def send_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int, 
 
 
 HOST = Embedded("host", estimate_nothing, start_nothing, send_nothing)
-"""In place of an observer that runs on the host (`coopenv.api.engine.PlugIns`)."""
+"""Placeholder for an observer that runs on the host (`coopenv.api.engine.PlugIns`)."""
 
 
 @device_function

@@ -123,10 +123,10 @@ WORLDS_PER_BLOCK, BLOCK_BYTES = 16, 2**20
 """Worlds that go through a decision together, and bytes of their state: at most, so that it stays in the cache."""
 WORLDS_PER_THREAD = 32  # smaller shares are not worth the handing over between threads
 VEHICLES_PER_THREAD = 64
-"""Of a world. Two threads run one world of 64, 128, 256 and 1,024 vehicles with `riccati` 1.3, 1.4, 1.6 and 1.9 times
-as fast as one, by the CPU time of the slower thread."""
+"""Vehicles of a world per thread. With `riccati`, two threads run one world of 64, 128, 256 and 1,024 vehicles 1.3,
+1.4, 1.6 and 1.9 times as fast as one, by the CPU time of the slower thread."""
 THREADS_PER_BLOCK = 32
-"""On a GPU: one warp, so that a small batch keeps all multiprocessors busy. 4,096 worlds run twice
+"""Threads per block on a GPU: one warp, so that a small batch keeps all multiprocessors busy. 4,096 worlds run twice
 as fast on an H200 as with blocks of 256, 65,536 worlds equally fast."""
 VEHICLES_PER_LEVEL = 8  # and lane; smaller levels (`coopenv.world.step.Turns`) are taken in turn
 

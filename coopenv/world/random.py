@@ -175,7 +175,7 @@ WANDER = wp.constant(_NUMBER["wander"])
 """Indices of the state's field `parameter`."""
 
 NOT_SET = -1.0
-"""In the state's field `parameter_set`: the factor is drawn."""
+"""Value in the state's field `parameter_set` for a drawn factor."""
 
 
 @wp.func

@@ -27,7 +27,7 @@ from coopenv.world.v2x import count_bytes, deliver, forget_everything
 from coopenv.world.warp_internals import device_function, host_only
 
 Kernels = dict[str, wp.Kernel]
-"""By name."""
+"""Kernels by name."""
 
 
 @device_function

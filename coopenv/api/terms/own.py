@@ -47,7 +47,7 @@ class OwnTerm(NamedTuple):
     returns: str = "a number"
     """Expected return value of the function."""
     weight: float = 0.0
-    """Of a reward term."""
+    """Weight of a reward term."""
     per: str = "vehicle"
     size: int = 1
     """Entries of one value."""

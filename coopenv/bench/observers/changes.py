@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from coopenv.observers.recording import Recording
 
 DIRECTION = np.array([0.6, 0.8, 0.0])
-"""Of a false position, map axes: horizontal, and along no road."""
+"""Direction of a false position, map axes: horizontal, and along no road."""
 
 
 def with_deliveries(recording: Recording, kept: np.ndarray) -> Recording:

@@ -136,7 +136,7 @@ def write_files(
 
 
 MOST_BYTES = 1_950_000
-"""Of a report: more than that mails badly and opens slowly on a phone."""
+"""Largest report: a larger file mails badly and opens slowly on a phone."""
 _COORDINATE = re.compile(r"(?<=[ML ])(-?\d+\.\d\d)\d+(?=[ \n])")
 """A coordinate of a line in SVG, of which hundredths of a point are enough."""
 

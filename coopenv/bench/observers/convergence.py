@@ -44,7 +44,7 @@ class Draw:
     converged: bool
     """True if the vehicle's final error is within CONVERGED."""
     convergence_time_s: float
-    """From then on the errors stay within CONVERGED; NaN where they do not."""
+    """Time (s) from which the errors stay within CONVERGED; NaN if they do not."""
     final_position_error_m: float
     final_orientation_error_deg: float
     failure: str

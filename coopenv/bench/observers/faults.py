@@ -53,7 +53,7 @@ class WorldFault(FaultKind):
     """A fault of simulated environments: keys of a vehicle in the scenario."""
 
     key: str = ""
-    """Of the value; start and options are keys of the same section."""
+    """Key of the value; start and options are keys of the same section."""
     renamed: Mapping[str, str] = field(default_factory=dict)
     """Keys whose name differs from that of the option, or from `start`."""
     vehicles: bool = True
@@ -171,7 +171,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         key="faults.corruption.probability",
     ),
 }
-"""By name."""
+"""Faults of the benchmark, by name."""
 
 
 @dataclass(frozen=True)

@@ -213,10 +213,10 @@ class Task:
     variant: str
     seed: int
     observers: Mapping[str, str | Factory]
-    """By name, as `registry.find` takes them in another process."""
+    """Observers by name, as `registry.find` accepts them in another process."""
     steady_from: float | None
     edges: tuple[float, ...] = ()
-    """s, of the windows that are judged one by one."""
+    """Edges of the windows that are judged one by one, s."""
 
     @property
     def world(self) -> tuple[RecordSource, str]:

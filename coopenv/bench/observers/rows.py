@@ -249,7 +249,7 @@ class WindowRow:
     observer: str
     vehicle: str
     window: str
-    """For example `5-10 s`, or `steady`."""
+    """Name of the window, for example `5-10 s` or `steady`."""
     from_s: float
     to_s: float
     position_rmse_m: float
@@ -306,7 +306,7 @@ class Leaderboard:
     samples: Sequence[JudgedRun] = field(repr=False)
     """One observer on one record each, by variant, observer, seed."""
     draws: Sequence[Draw] = field(default=(), repr=False)
-    """Of initial estimates, by observer, where basins were studied."""
+    """Draws of initial estimates, by observer, where basins were studied."""
 
     @cached_property
     def groups(self) -> dict[tuple[str, str], list[JudgedRun]]:
@@ -363,7 +363,7 @@ class Leaderboard:
 
     @property
     def vehicles(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the vehicles."""
         return self.samples[0].scene.vehicles
 
     @property

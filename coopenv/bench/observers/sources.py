@@ -62,7 +62,7 @@ class RecordSource(ABC):
 
     @property
     def variants(self) -> dict[str, str]:
-        """All variants there are, each with what it is."""
+        """All variants, with a description each."""
         return {**self.named, **{variant.name: variant.summary for variant in self.added}}
 
     def fault(self, variant: str) -> FaultVariant:
@@ -127,7 +127,7 @@ class SimulatedRecords(RecordSource):
     policy: str = "zero"
     """Policy of the driven vehicles, as for `coopenv.runs.recorder.record`."""
     actions: Mapping[int, np.ndarray] | None = field(default=None, compare=False)
-    """By seed the actions (decisions, rows, A) that driven vehicles take in place of those of the policy."""
+    """Actions (decisions, rows, A) by seed, which driven vehicles take in place of the policy's."""
     seeded: ClassVar[bool] = True
 
     def world(self) -> Scenario:

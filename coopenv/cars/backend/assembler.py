@@ -1,4 +1,4 @@
-"""From samples of all cars to ticks.
+"""Assembly of ticks from the samples of all cars.
 
 A tick has a row per car. A row holds for one time of that car, its *moment*: the exposure of the camera frame of the
 tick. Odometry is integrated over the real time from one moment to the next. So a late frame corrects the pose at its
@@ -61,7 +61,7 @@ KINDS = {
     **dict.fromkeys((Role.WHEEL, Role.IMU, Role.ODOMETRY), "odometry"),
     **dict.fromkeys((Role.DETECTIONS, Role.BEARINGS), "frame"),
 }
-"""By role, the kind of a sample in counts of refused ones; others are messages between cars."""
+"""Kind of a sample, by role, in counts of refused samples; other roles are messages between cars."""
 
 
 class Assembler:
@@ -226,7 +226,7 @@ class Intake:
         self.rejected: dict[str, Counter[str]] = {name: Counter() for name in (*binding.cars, *binding.leaders)}
         """Messages that could not be used, by car and role."""
         self.calibrations = {name: Calibration.of(binding.scenario.cameras[i]) for name, i in binding.cars.items()}
-        """Of the environment, by car."""
+        """Calibrations of the environment, by car."""
         truth: tuple[Role, ...] = (Role.TRUTH,) if sensors.truth else ()
         own = (*VELOCITY[sensors.odometry], Role(sensors.detections), *truth)
         roles = {name: own if i in binding.local else (*truth, *BROADCAST) for name, i in binding.cars.items()}

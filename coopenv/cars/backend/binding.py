@@ -111,7 +111,7 @@ def _index(known: Sequence[str], name: str, where: str) -> int:
 
 
 OPTIONS = ("arm", "release")
-"""Of a reset: whether the cars drive, and whether cars that another station has stopped drive as well."""
+"""Options of a reset: arm the cars, and release cars that another station has stopped."""
 
 
 def reset_options(options: Mapping[str, Any]) -> tuple[bool, bool]:

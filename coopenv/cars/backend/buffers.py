@@ -177,7 +177,7 @@ class FrameQueue:
 
 ROLES = (Role.STATE, Role.REMOTE, Role.BATTERY, Role.CAMERA_INFO)
 TOLERANCES = {"image_size": 0.5, "focal_length": 2.0, "principal_point": 2.0, "distortion": 0.02}
-"""By which a camera's own calibration may differ from the environment's: pixels; each coefficient of the distortion."""
+"""Largest difference between a camera's own calibration and the environment's: pixels; each distortion coefficient."""
 
 
 class Condition(NamedTuple):
@@ -211,7 +211,7 @@ class StatusBoard:
         self._begun: dict[tuple[str, Role], Condition] = {}  # as they were at arming
         self._happened: dict[str, str] = {}
         self.calibrations: dict[str, Calibration] = {}
-        """Of the cars that publish theirs."""
+        """Calibrations of the cars that publish theirs."""
         for topic in self._topics:
             transport.subscribe(topic, self._take)
 

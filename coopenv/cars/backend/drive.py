@@ -39,7 +39,7 @@ MARKS = {TICK_TOPIC: TICK, STOPPED_TOPIC: STOPPED}
 """Types of the messages of ticks and stops, by topic."""
 
 FLUSH = 0.5
-"""s after which at the latest the system has what was written: so much is lost if the process is killed."""
+"""Longest time (s) until records reach the system; a killed process loses no more."""
 
 
 class DriveRecorder:

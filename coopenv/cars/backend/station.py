@@ -99,7 +99,7 @@ class Pacer:
         self._period = round(period * 1e9)
         self._decision = self._period * per_decision
         self.lateness: deque[float] = deque(maxlen=KEPT)
-        """s by which ticks were given after their time."""
+        """Lateness (s) of the last ticks."""
         self.start()
 
     def now(self) -> int:
@@ -350,7 +350,7 @@ BYPASSED = (
 
 
 UNTRIED = "has no access rules: past the gate, any of its programs can command the wheels; arming cannot try that"
-"""Of networks other than Zenoh."""
+"""Warning for networks other than Zenoh."""
 
 
 def neutral_command(profile: CarProfile, car: str) -> tuple[str, bytes]:

@@ -111,7 +111,7 @@ def checked(stamps: Times, received: Times) -> tuple[NDArray[np.bool_], Delay | 
 HOLE = 0.25  # s between two messages over which nothing is compared
 INTERVAL = 0.4  # s over which turns and distances are compared
 SEARCHED, STEP = 1.0, 0.02
-"""s to both sides in which an offset is looked for, and the step of the search."""
+"""Search range of an offset to both sides, and step of the search, s."""
 BLOCK = 2.0  # s within which errors are taken as dependent
 SURE = 4.0  # standard errors above which an offset counts
 FLOOR, PARALLAX = 0.001, 0.015

@@ -22,7 +22,7 @@ from coopenv.cars import codec
 METADATA, PACKED = "metadata.yaml", ".zstd"
 
 REPAIRS = {".bag": "rosbag reindex", ".db3": "sqlite3 FILE .recover", ".mcap": REPAIR}
-"""By the suffix of bags that are files, the tool that mends one whose recording was cut off."""
+"""Repair tool for a bag with a truncated recording, by the suffix of the file."""
 
 LATEST = 4 * 10**18  # ns, in 2096: sums of two such times fit into 64 bits
 

@@ -322,9 +322,9 @@ class BagLog:
     notes: tuple[str, ...]  # what a user should know
     lenses: Mapping[str, Calibration] = field(default_factory=dict)  # by car; none: its bearings are without pixels
     added: Mapping[tuple[str, Role], tuple[str, float]] = field(default_factory=dict)
-    """By car and role: the topic, and s that were added to its stamps."""
+    """Topic, and s added to its stamps, by car and role."""
     sent: Mapping[tuple[str, Role], tuple[Sample, ...]] = field(default_factory=dict)
-    """By car and role, the samples with unchanged times."""
+    """Samples with unchanged times, by car and role."""
 
 
 def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog:

@@ -33,7 +33,7 @@ PATTERNS: dict[str, dict[Role, tuple[str, ...]]] = {
     "authors": {role: tuple(f"/{name}" for name in names) for role, names in AUTHORS.items()},
     "none": {},
 }
-"""By name and role: the first of them that a bag has counts."""
+"""Candidate topics by name and role: the first in the bag counts."""
 
 
 def patterns_of(names: str, make: CarProfile) -> dict[Role, tuple[str, ...]]:
@@ -117,11 +117,11 @@ class Correction(Section):
     """Constants of a car, as `coopenv calibrate` finds them."""
 
     focal_length: PositiveVector2 | None = None
-    """Of its camera, instead of that of CameraInfo, px."""
+    """Focal length of its camera, instead of CameraInfo's, px."""
     principal_point: Vector2 | None = None
-    """Of its camera, px."""
+    """Principal point of its camera, px."""
     distortion: tuple[Number, ...] | None = None
-    """Of its camera: 5 coefficients, 8, or 4 of a fisheye."""
+    """Distortion of its camera: 5 or 8 coefficients, or 4 of a fisheye."""
     wheel_scale: float = Field(default=0.0, gt=-1.0, le=10.0)
     """Relative error of its speeds, removed."""
     gyro_bias: Number = 0.0
@@ -157,7 +157,7 @@ class ClockSettings(Section):
     offsets: dict[str, Number] = Field(default={}, max_length=64)
     """Time added to the stamps of a car, of `truth`, or of a topic, instead of the estimated offset, s."""
     leads: dict[TopicName, Number] = Field(default={}, max_length=64)
-    """By how much the stamps of a topic are too early in every drive, s: added before offsets are estimated."""
+    """Lead of a topic's stamps in every drive, s: added before offsets are estimated."""
 
 
 TURN = round(2.0 * math.pi, 4)  # rad
@@ -176,9 +176,9 @@ class PositionFrames(Section):
     """Frames of the bag's positions."""
 
     map: MapFrame = MapFrame()
-    """Of the cars' messages."""
+    """Frame of the cars' messages."""
     truth: MapFrame | None = None
-    """Of motion capture (default: the same)."""
+    """Frame of motion capture (default: the same)."""
 
 
 class TopicMap(Section):
@@ -215,7 +215,7 @@ class TopicMap(Section):
     vision: VisionSettings = VisionSettings()
     """Frames and tags (default: those of the profile)."""
     make: CarProfile = Field(default=SVEA, exclude=True)
-    """Of `names`, or SVEA's; set by `load_map`."""
+    """Profile of `names`, or SVEA's; set by `load_map`."""
     path: Path = Field(default=Path("topics.toml"), exclude=True)
     """The file; set by `load_map`."""
 
@@ -301,7 +301,7 @@ class Chosen:
 
     @property
     def source(self) -> str:
-        """Whose clock makes its stamps."""
+        """Clock of its stamps."""
         return TRUTH if self.role is Role.TRUTH else self.topic if self.role is Role.COMMAND else self.car
 
     @property

@@ -22,7 +22,7 @@ from coopenv.cars.fake.car import Fake
 from coopenv.cars.gate_process import CLOCK, prepare_gate
 
 READY = 300.0
-"""s that fakes have until they can be seen: the first ones on a computer compile the simulation's kernels."""
+"""Longest start of fakes, s: the first ones on a computer compile the simulation's kernels."""
 GRACE = 0.5  # s that processes have to end by themselves
 POLL = 0.02  # s
 LOOPBACK = "127.0.0.1"
@@ -157,7 +157,7 @@ before_a_hard_end(_kill_all)
 
 
 REST = 0.004
-"""s between two looks at the clock, at least: what falls due meanwhile is done together."""
+"""Least time (s) between two checks of the clock: events due in between run together."""
 
 
 def prepare_fake(path: str | Path, car: str, gate: bool = True, station: str | None = None) -> Callable[..., Fake]:

@@ -156,7 +156,7 @@ def deviation(stated: float, noise: Noise, rate: float) -> float:
 CAMERA_INFO_RATE = 1.0  # Hz
 OLDEST = 255  # frames that the camera counts
 BLUR, NOISE = 0.5, 2.0
-"""Of frames, standard deviations: pixels and shades."""
+"""Standard deviations of blur and noise of frames: pixels and shades."""
 
 
 class Spot(NamedTuple):

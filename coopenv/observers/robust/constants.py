@@ -28,7 +28,7 @@ LINEAR_ANGLE = 0.05
 """rad: largest turn of a line of sight without another linearisation, and largest standard deviation of a sender's
 position, as an angle in view, for which its increments are applied. Tuned."""
 LINEARISATION_TIME, CONSIDERED_LINEARISATION_TIME = 0.1, 12.0
-"""s for which the linearisation error of a bearing is correlated, so that all frames of that time count as one: for a
+"""Correlation time of a bearing's linearisation error, s; all frames of that time count as one: for a
 landmark, and for another vehicle, whose error no later bearing corrects. Tuned."""
 MAX_ACCELERATION = 1.0  # m/s^2 by which a member may leave its last known twist. Chosen: an ordinary start or stop
 MAX_SMOOTH_ACCELERATION = 10.0  # m/s^2 and rad/s^2: largest one by brakes and steering. Chosen
@@ -59,12 +59,12 @@ and the pose is an anchor. Chosen: one wrong association of two does not exceed 
 # Messages
 
 NEWS_TIME = 0.2
-"""s between the reports of a sender that are fused; of those in between only the odometry is used. Also for which all
-solutions of a search must be well determined, and from a frame in which they are not to the next attempt. Chosen."""
+"""Period (s) of fusing a sender's reports; reports in between contribute their odometry alone. Also the time for which
+all solutions of a search must be well determined, and the delay after a frame in which they are not. Chosen."""
 STEPS = 127  # of a correlation in a message, from 0 to 1
 MAX_CORRELATIONS = 2  # in a message, which has 256 bytes then
 CORRELATION_VALIDITY = 1.037
-"""s between two reports of a vehicle within which the correlation of one is used for the other. It hardly changes in a
+"""Longest time (s) between two reports for which the correlation of one is used for the other. It hardly changes in a
 second, and a missing correlation is worse. No multiple of usual frame periods. Chosen."""
 RETURNING_SHARE = 0.7
 """Ratio of the variances of the sender's and the own position above which bearings to a sender are not used, if the

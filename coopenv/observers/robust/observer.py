@@ -390,7 +390,7 @@ def conclude(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
 
 
 OPTIONS = {"max_unroll": 1}
-"""Of the Warp module. Unrolled loops make long code, which takes long to compile and is no faster."""
+"""Options of the Warp module. Unrolled loops make long code, which compiles slowly and runs no faster."""
 
 ROBUST = Embedded(
     "robust",
