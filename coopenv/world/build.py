@@ -106,7 +106,7 @@ def _groups(scenario: Scenario) -> dict[str, Any]:
 
 
 def fault_entries(f: Faults, scenario: Scenario) -> dict[str, Any]:
-    """Return the values of the model's `FaultValues` that are not entries of the section as they stand."""
+    """Return the values of the model's `FaultValues` that differ from entries of the section."""
     lie, wrong = f.lie, f.map_error
     return {
         "clock": f.clock_offset,
@@ -130,7 +130,7 @@ def _unit(direction: tuple[float, float, float] | None) -> np.ndarray:
 
 
 def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
-    """Return the values of the model's `CameraValues` that are not the camera's own."""
+    """Return the values of the model's `CameraValues` that differ from the camera's own."""
     on = float(noise.enabled)
     return {
         "rotation": c.to_body(),
@@ -144,7 +144,7 @@ def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
 
 
 def noise_entries(n: Noise, rates: Rates) -> dict[str, Any]:
-    """Return the values of the model's `NoiseValues` that are not entries of the section as they stand."""
+    """Return the values of the model's `NoiseValues` that differ from entries of the section."""
     on = float(n.enabled)
     axis = np.array(n.bearing.axis) / np.linalg.norm(n.bearing.axis)
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
@@ -172,7 +172,7 @@ def _at_rate(std: float, stated: float | str, actual: float) -> float:
 
 
 GRAMIAN_RATE = 20.0
-"""Hz at which the sliding Gramian is sampled: it measures the view of the scene over a second."""
+"""Sampling rate (Hz) of the sliding Gramian, which measures the view of the scene over a second."""
 
 GRAMIAN_BLOCKS = 10  # blocks of the sliding window of the observability Gramian; it moves on by one block
 
@@ -182,7 +182,7 @@ a grid, with 8 items; 1.42 and 1.28 us with 16; 3.16 and 2.13 us with 32 (half o
 CELLS_PER_RANGE, LONGEST_CELL = 3.0, 60.0
 """Cells of the grid within the shortest range of a camera; the range that counts where all are unlimited, m. With 1, 2,
 3, 4 and 6 cells sensing takes 9.2, 7.4, 6.5, 7.2 and 10.9 us for each of 1,024 vehicles that are 12 m apart."""
-WIDER = 1.01  # factor of what a building reaches, against rounding in the kernels
+WIDER = 1.01  # factor of a building's extent, against rounding in the kernels
 
 NOWHERE = (0.0, 0.0, 0.0)
 
@@ -222,8 +222,8 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
 def _fill(struct: Any, device: str, values: Mapping[str, Any], section: Any = None) -> None:
     """Write fields of a struct in their types: the values, and entries of the same names of a scenario's section.
 
-    An entry of a table in the section has the name of both, such as `jammer_period`. A limit that there is not (None)
-    is infinite.
+    An entry of a table in the section has the names of both, such as `jammer_period`. A missing limit (None) is
+    infinite.
     """
     entries = dict(section or ())
     tables = {name: table for name, table in entries.items() if isinstance(table, Section)}

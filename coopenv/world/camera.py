@@ -1,7 +1,7 @@
 """Camera: which targets are in view and not occluded, and their noisy unit bearings.
 
 A bearing is stored as the unit vector from the observing camera to the target, in the camera's optical frame; of a
-camera that pans in that frame without pan, as the vehicle knows the angle; readers of a bearing need no pan.
+panning camera, in that frame without pan, because the vehicle knows the angle; readers of a bearing need no pan.
 """
 
 from typing import Any
@@ -136,7 +136,7 @@ def inverse_square_of(direction: Any):
 
 @device_function
 def occlusion(model: Any, state: Any, world: int, observer: int, target: int, origin: Any, direction: Any):
-    """Return VISIBLE, or what blocks the line of sight; neither end's own body does."""
+    """Return VISIBLE, or the obstruction of the line of sight; the bodies at its ends do not count."""
     inverse_square = inverse_square_of(direction)
     if behind_building(model, origin, direction, inverse_square):
         return OCCLUDED_BY_BUILDING
@@ -225,7 +225,7 @@ def through_pixels(camera: Any, bearing: Any):
 
 @wp.func
 def has_pixel(model: Any, camera: Any, ray: Any) -> bool:
-    """Return whether what is measured along a ray falls on the image: ideal sensing measures beyond it too."""
+    """Return whether a measurement along a ray is inside the image: ideal sensing measures beyond it too."""
     if model.sensing != IDEAL:
         return True
     _, _, inside = project(camera, ray)

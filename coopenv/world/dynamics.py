@@ -118,7 +118,7 @@ def reaches_goal(model: Any, state: Any, world: int, vehicle: int) -> bool:
 def has_left_route(model: Any, state: Any, world: int, vehicle: int) -> bool:
     """Return whether a vehicle is farther beside its route, or beyond an end of it, than is allowed.
 
-    It is looked at where a decision ends.
+    The check runs at the end of a decision.
     """
     allowed = model.scene.off_route
     if allowed <= allowed.dtype(0.0) or (state.tick[world] + 1) % model.ticks_per_decision != 0:
@@ -175,7 +175,7 @@ def sanitised(level: Any):
 
 @wp.func
 def command_of(d: Any, first: Any, steering: Any, pan: Any):
-    """Return what the entries of an action in [-1, 1] ask of a vehicle with the dynamics `d`.
+    """Return the command of an action's entries in [-1, 1] to a vehicle with the dynamics `d`.
 
     Where the first entry means an acceleration, the speed to reach is a limit of the vehicle: the highest or, to
     brake, the lowest.
@@ -226,7 +226,7 @@ def decide(model: Any, state: Any, actions: Any, world: int):
 
 @device_function
 def command_in_force(model: Any, state: Any, world: int, vehicle: int, tick: int):
-    """Return what the actuators follow during a tick: after a decision, the last command for the dead time."""
+    """Return the command that the actuators follow during a tick: for the dead time after a decision, the last one."""
     if (tick - 1) % model.ticks_per_decision < model.dynamics[vehicle].latency_ticks:
         return state.last_command[world, vehicle]
     return state.command[world, vehicle]
@@ -336,7 +336,7 @@ def bicycle_step(d: Any, R: Any, position: Any, speed: Any, steering: Any, comma
 
 @device_function
 def drive(model: Any, state: Any, world: int, vehicle: int, command: Any, duration: wp.float64):
-    """Advance a driven vehicle in short steps; one that is absent, or whose episode has ended, stands still."""
+    """Advance a driven vehicle in short steps; an absent vehicle, or one with an ended episode, stands still."""
     agent = model.landmarks + vehicle
     limits = model.dynamics[vehicle]
     R = state.rotation[world, agent]
@@ -387,7 +387,7 @@ def drive_through(model: Any, state: Any, world: int, vehicle: int, command: Any
 
 @device_function
 def turn_camera(model: Any, state: Any, world: int, vehicle: int, command: Any):
-    """Turn a vehicle's camera through one camera tick towards the angle that is asked for."""
+    """Turn a vehicle's camera through one camera tick towards the commanded angle."""
     limits = model.dynamics[vehicle]
     if limits.pan_limit > type(limits.pan_limit)(0.0):
         pan = state.pan[world, vehicle]

@@ -25,7 +25,7 @@ from coopenv.world.warp_internals import device_function
 
 @wp.struct
 class Nothing:
-    """The memory of an observer that has none, and the record of a source that needs none."""
+    """Empty struct: memory of an observer without any, and record of a source without any."""
 
     unused: wp.int32
 
@@ -75,9 +75,9 @@ class Embedded:
     """An observer that runs in the world's kernels.
 
     Its functions read what a vehicle senses and receives from `state`, write its estimate there (`estimate_rotation`,
-    `estimate_position`, `covariance`, `corrected_tick`), and keep whatever else they need in `memory`. `model` and
-    `state` are those of `coopenv.world`; of truth they may read where landmarks are, and nothing else. A vehicle writes
-    its own rows alone, and reads of another one what has arrived from it: vehicles may run at once.
+    `estimate_position`, `covariance`, `corrected_tick`), and keep their own variables in `memory`. `model` and
+    `state` are the ones of `coopenv.world`; the only truth that they may read is the landmarks' positions. A vehicle
+    writes its own rows alone, and reads only received data of other vehicles: vehicles may run at once.
     """
 
     name: str
@@ -90,7 +90,7 @@ class Embedded:
     covariance is `coopenv.world.v2x.start_covariance` (LEFT coordinates); vehicles come leaders first. Called again
     for a vehicle that restarts, see `[faults.restart]`."""
     send: Any
-    """(model, state, memory, world, vehicle, tick): broadcast what the V2X pose estimate does not carry; called
+    """(model, state, memory, world, vehicle, tick): broadcast data beyond the V2X pose estimate; called
     at every tick, after `start` as well."""
     memory: Any = Nothing
     """A Warp struct whose arrays are declared with `coopenv.world.state.array`, the axes W (worlds) and N (vehicles)
@@ -113,7 +113,7 @@ class Embedded:
     not, and the observer is compiled once more."""
 
     def __post_init__(self) -> None:
-        """Refuse what is no such function. Raises CoopenvError."""
+        """Check that all parts are Warp functions. Raises CoopenvError."""
         given = (*(("estimate", part, 6) for part in self.parts), ("start", self.start, 5), ("send", self.send, 6))
         for name, part, count in given:
             if not isinstance(part, wp.Function) or len(signature(part.func).parameters) != count:

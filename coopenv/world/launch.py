@@ -1,7 +1,7 @@
 """Compile kernels once per precision, keep them on disk, replay their launches, and split them over threads.
 
-Each kernel gets a Warp module of its own and of its precision, so that it is compiled once and then found in the cache
-whatever else a program uses. A generic kernel in a shared module would be rebuilt for every new combination.
+Each kernel has its own Warp module per precision, so that it is compiled once and then found in the cache,
+independent of the program. A generic kernel in a shared module would be rebuilt for every new combination.
 
 Warp's cache on the disk: damaged modules are rebuilt, a folder that cannot be written is one error line, and a module
 that several processes need is compiled by one of them.
@@ -43,7 +43,7 @@ class KernelCacheError(CoopenvError):
 
 @contextmanager
 def _written() -> Iterator[None]:
-    """Say where compiled kernels should have gone, and what to do."""
+    """State the folder of the compiled kernels, and the remedy."""
     try:
         yield
     except OSError as error:
@@ -54,7 +54,7 @@ def _written() -> Iterator[None]:
 
 
 def launch(kernel: wp.Kernel, **options: Any) -> Any:
-    """Do what `wp.launch` does with a kernel that is in memory, in the cache, damaged there, or not compiled yet."""
+    """Launch as `wp.launch` a kernel that is in memory, in the cache, damaged there, or not compiled yet."""
     name = kernel.module.name
     if name in _loaded:
         try:
@@ -74,7 +74,7 @@ def _launch(kernel: wp.Kernel, options: dict[str, Any]) -> Any:
             probe()  # LLVM ends the process where it cannot write
         try:
             return wp.launch(kernel, **options)
-        except Exception:  # Warp raises what it has: OSError, ValueError, RuntimeError, Exception itself
+        except Exception:  # Warp raises OSError, ValueError, RuntimeError and Exception itself
             for module in kept:
                 shutil.rmtree(module, ignore_errors=True)
             probe()
@@ -104,7 +104,7 @@ def cache_folder() -> Path:
 
 
 def modules() -> set[str]:
-    """Return the names of the folders of compiled modules; those that are being compiled have one, too."""
+    """Return the names of the folders of compiled modules, including modules that are being compiled."""
     try:
         return {entry.name for entry in cache_folder().iterdir() if entry.name.startswith(_MODULE)}
     except OSError:
@@ -135,7 +135,7 @@ VEHICLES_PER_LEVEL = 8  # and lane; smaller levels (`coopenv.world.step.Turns`) 
 def start_warp() -> None:
     """Initialise Warp, which makes the folder of the cache, without its banner.
 
-    Neither is there the notice that its library prints where no GPU driver is.
+    The notice of its library about a missing GPU driver is suppressed, too.
 
     Raises:
         KernelCacheError: the folder cannot be made.
@@ -206,7 +206,7 @@ def compiler_options() -> dict[str, Any]:
 
 
 def default_threads() -> int:
-    """Return how many threads a launch on the CPU may be split over: all cores, or COOPENV_THREADS."""
+    """Return the largest number of threads of a launch on the CPU: all cores, or COOPENV_THREADS."""
     wanted = os.environ.get("COOPENV_THREADS", "")
     if wanted and not (wanted.isascii() and wanted.isdecimal() and int(wanted) > 0):
         raise CoopenvError(f"COOPENV_THREADS must be a positive whole number, got '{wanted}'")
@@ -214,9 +214,9 @@ def default_threads() -> int:
 
 
 def threads_and_lanes(worlds: int, vehicles: int, device: str, threads: int | None = None) -> tuple[int, int]:
-    """Return over how many threads a batch is split, and over how many lanes every world of it.
+    """Return the number of threads of a batch, and the number of lanes of each of its worlds.
 
-    One of them is 1: a thread takes some of the worlds, or some of the vehicles of every world, whichever keeps more
+    One of them is 1: a thread takes some of the worlds, or some of the vehicles of every world; the choice keeps more
     threads busy. A GPU has a thread per world, or per vehicle of every world.
     """
     by_world = worlds if threads is not None else worlds // WORLDS_PER_THREAD
@@ -240,7 +240,7 @@ class PerWorld:
         if share == (0, worlds):
             return self.value
         if isinstance(self.value, wp.array):
-            return self.value[slice(*share)] if self.value.size > 0 else self.value  # Warp cannot slice what is empty
+            return self.value[slice(*share)] if self.value.size > 0 else self.value  # Warp cannot slice an empty array
         part = type(self.value)()
         for name in field_types(self.value):
             value = getattr(self.value, name)
@@ -250,7 +250,7 @@ class PerWorld:
 
 @dataclass(frozen=True)
 class PerLane:
-    """Marks a kernel argument that every lane on the CPU has one of: records that differ in their scratch."""
+    """Marks a kernel argument with one record per lane on the CPU: records that differ in their scratch."""
 
     values: Sequence[Any]
 
@@ -259,11 +259,11 @@ class Launcher:
     """Launches kernels whose grid is (worlds, ...) on one device.
 
     The first launch under a key is recorded and later ones replay it in about a microsecond, so a key must always come
-    with the same arguments. On the CPU the batch may be split over threads: worlds do not talk to one another, so the
+    with the same arguments. On the CPU the batch may be split over threads: worlds are independent, so the
     result does not depend on the split. Launches release the interpreter lock.
 
     In place of the batch its worlds may be split, over `lanes` (`threads_and_lanes`): every lane has some vehicles of
-    all worlds. What vehicles do at once then comes by `by_lane` and `by_vehicle`.
+    all worlds. Work of vehicles in parallel then uses `by_lane` and `by_vehicle`.
     """
 
     def __init__(
@@ -353,7 +353,7 @@ class Launcher:
             other.result()
 
     def _workers(self) -> ThreadPoolExecutor:
-        """Return this process's threads: those of a parent process do not exist after a fork."""
+        """Return this process's threads: a parent's threads do not exist after a fork."""
         if self._pool is None or self._pool_owner != os.getpid():
             threads = max(len(self._shares), self._lane_threads)
             self._pool, self._pool_owner = ThreadPoolExecutor(threads - 1), os.getpid()

@@ -158,7 +158,7 @@ def model_struct(p: Precision) -> Any:
         across: wp.int32  # cells along each axis, a power of two; 1: all pairs are tested
         per_metre: scalar  # 1 / edge of a cell
         body_reach: scalar  # m, the farthest point of an agent's box from the agent
-        first_building: wp.array(dtype=wp.int32)  # (across^2 + 1,) of those that reach a cell
+        first_building: wp.array(dtype=wp.int32)  # (across^2 + 1,) of the buildings that reach a cell
         building: wp.array(dtype=wp.int32)
 
     @wp.struct
@@ -203,7 +203,7 @@ def model_struct(p: Precision) -> Any:
         easy: wp.array(dtype=scalar)  # (Q,) factor at difficulty 0
         hard: wp.array(dtype=scalar)  # (Q,) and at 1
         level: scalar  # difficulty, unless another one is set
-        entry: wp.array(dtype=vec2)  # (N,) s, first and last time of its appearance; negative: it is there at the reset
+        entry: wp.array(dtype=vec2)  # (N,) s, first and last time of its appearance; negative: present at the reset
         leaves: wp.int32  # 1: vehicles leave where no route follows, 0: they stand there
         next_row: wp.array(dtype=wp.int32)  # (N,) row of a vehicle in the next table
         next_first: wp.array2d(dtype=wp.int32)  # (K, R + 1) routes that may follow route r in row k ...
@@ -257,7 +257,7 @@ def model_struct(p: Precision) -> Any:
         """V2X."""
 
         entry: wp.int32  # place of an action's first number for the radio; 0: everything is broadcast
-        to_all: wp.int32  # whether messages reach all vehicles, not only those that may measure their sender
+        to_all: wp.int32  # 1: messages reach all vehicles, not only vehicles that may measure their sender
         delay: wp.int32  # ticks
         period: wp.int32  # ticks
         slots: wp.int32
@@ -340,7 +340,7 @@ def model_struct(p: Precision) -> Any:
         agents: wp.int32
         obstacles: wp.int32
         traffic: wp.int32  # moving bodies without identity, at most
-        sensed: wp.int32  # 1: `topology.mode` asks for what is in view, 0: for every neighbour
+        sensed: wp.int32  # 1: `topology.mode` measures targets in view, 0: every neighbour
         sensing: wp.int32  # SENSED, IDEAL or BLIND
         camera_rate: wp.float64  # Hz
         odometry_rate: wp.float64  # Hz
@@ -354,7 +354,7 @@ def model_struct(p: Precision) -> Any:
         coordinates: wp.int32  # in which the observer states its covariance at first, see `coopenv.world.quality`
         kept: wp.int32  # agents that a vehicle keeps at a time, see `coopenv.world.nearby`; 0: all
         before_boxes: wp.int32  # entries before that of the first box: all landmarks, or none where some are kept
-        listed: wp.int32  # where some are kept: 1: those in `targets`, which has as many columns, 0: those in range
+        listed: wp.int32  # where some are kept: 1: agents in `targets`, which has as many columns, 0: in range
         acyclic: wp.int32  # where some are kept: 1: a vehicle measures the vehicles before it alone
         marker_reach: scalar  # m, the farthest visible point of an agent from the agent
         last_outcome: wp.int32  # largest value of `ended`

@@ -1,13 +1,13 @@
 """Neighbourhood of a vehicle: bodies, found by a grid of cells, and the agents that it keeps.
 
-A uniform grid of square cells finds bodies near a place, exactly: users test what is in the cells of a window. The grid
+A uniform grid of square cells finds bodies near a position, exactly: users test the items in a window's cells. The grid
 has `across` cells along x and as many along y, and repeats: a window no larger than the grid meets each of its cells
 once. Small worlds have one cell, and then all pairs are tested. Moving items (agents, then bodies of the traffic) are
 lists that are linked anew at each tick; buildings, which do not move, are in every cell that they reach.
 
-A vehicle keeps the agents in range, which it may measure or receive, and earlier ones where there is room. What it has
-measured and received is in arrays with an entry per agent and, of messages, a box per sender. In a world whose model
-has `kept` above 0 there are so many entries only, however many agents there are. An entry then stays with its agent
+A vehicle keeps the agents in range, which it may measure or receive, and earlier ones where there is room. Arrays of
+its measurements have an entry per agent, arrays of its messages a box per sender. With the model's `kept` above 0,
+there are only so many entries, regardless of the number of agents. An entry then stays with its agent
 until another agent needs it; the agent that is farthest out of range makes room. In range are the agents that the
 camera, or the radio, may reach. Vehicles whose neighbours are listed keep these. All senders without a box share the
 last one, which is always empty.
@@ -23,9 +23,9 @@ from coopenv.world.random import CAMERA_RANGE
 from coopenv.world.warp_internals import device_function
 
 FAR = wp.constant(1.0e8)
-"""Largest number of a cell, so that it fits into an integer."""
+"""Largest cell number that fits into an integer."""
 WIDER, ROUNDING = wp.constant(1.01), wp.constant(0.01)
-"""Factor of the reach of a window, and m that are added to it, so that rounding leaves nothing out."""
+"""Factor of a window's reach, and margin (m), so that rounding leaves nothing out."""
 
 
 @wp.func
@@ -66,7 +66,7 @@ def last_of_all(model: Any) -> int:
 
 @wp.func
 def first_in(state: Any, world: int, cell: int, last: int) -> int:
-    """Return the first item of a cell; -1: none. `last` is that of all, read once per window."""
+    """Return the first item of a cell; -1: none. `last` is the grid's, read once per window."""
     if last >= 0:
         return 0
     return state.first_item[world, cell]
@@ -82,7 +82,7 @@ def next_in(state: Any, world: int, item: int, last: int) -> int:
 
 @device_function
 def put_into_cell(model: Any, state: Any, world: int, item: int, position: Any):
-    """Put an item into the grid, in front of those that are in its cell."""
+    """Put an item into the grid, in front of the other items of its cell."""
     cell = cell_at(model, cell_of(model, position[0]), cell_of(model, position[1]))
     state.next_item[world, item] = state.first_item[world, cell]
     state.first_item[world, cell] = item
@@ -102,7 +102,7 @@ def clear_cells(model: Any, state: Any, world: int):
 
 @device_function
 def sort_into_cells(model: Any, state: Any, world: int):
-    """Fill the grid of a world with where everything is now."""
+    """Fill the grid of a world with the present positions."""
     if model.cells.across > 1:
         clear_cells(model, state, world)
         for agent in range(model.agents):
@@ -111,7 +111,7 @@ def sort_into_cells(model: Any, state: Any, world: int):
 
 @device_function
 def has_body(model: Any, state: Any, world: int, item: int) -> bool:
-    """Return whether an item is there and is a box, not a point."""
+    """Return whether an item is present and is a box, not a point."""
     if item >= model.agents:
         edges = state.traffic_half[world, item - model.agents]
         return edges[0] > edges.dtype(0.0)
@@ -135,7 +135,7 @@ NOT_A_NEIGHBOUR = wp.constant(wp.uint8(Sight.NOT_A_NEIGHBOUR))
 
 @wp.func
 def entry_count(model: Any, state: Any, world: int, vehicle: int) -> int:
-    """Return how many entries there are with targets, and in worlds with `kept` with senders that are no targets."""
+    """Return the number of entries with targets, and in worlds with `kept` also with senders that are no targets."""
     if model.kept == 0:
         return model.target_count[vehicle]
     return state.kept_count[world, vehicle]
@@ -143,7 +143,7 @@ def entry_count(model: Any, state: Any, world: int, vehicle: int) -> int:
 
 @wp.func
 def entry_at(model: Any, state: Any, kept: int, world: int, vehicle: int, n: int) -> int:
-    """Return the n-th of these entries, in the order of the agents; `kept` is that of the model, read once per loop."""
+    """Return the n-th of these entries, in the order of the agents; `kept` is the model's, read once per loop."""
     if kept == 0:
         return model.targets[vehicle, n]
     return state.kept_order[world, vehicle, n]
@@ -202,7 +202,7 @@ def entry_of(model: Any, state: Any, world: int, vehicle: int, agent: int) -> in
 
 @device_function
 def box_of(model: Any, state: Any, world: int, vehicle: int, sender: int) -> int:
-    """Return the box of a sender; one that is not kept has the last one."""
+    """Return the box of a sender; senders that are not kept share the last one."""
     if model.kept == 0:
         return sender
     entry = entry_of(model, state, world, vehicle, model.landmarks + sender)
@@ -217,7 +217,7 @@ def is_target(model: Any, vehicle: int, agent: int) -> bool:
 
 @device_function
 def clear_entry(state: Any, world: int, vehicle: int, entry: int):
-    """Clear what has been measured of an agent."""
+    """Clear the measurements of an agent."""
     o = type(state.bearing[world, vehicle, entry])()
     state.bearing[world, vehicle, entry] = o
     state.bearing_tick[world, vehicle, entry] = -1
@@ -226,7 +226,7 @@ def clear_entry(state: Any, world: int, vehicle: int, entry: int):
 
 @device_function
 def clear_box(state: Any, world: int, vehicle: int, box: int):
-    """Clear what has been received of a sender."""
+    """Clear the messages received from a sender."""
     o = type(state.inbox_position[world, vehicle, box])()
     state.arriving[world, vehicle, box] = -1
     state.inbox_tick[world, vehicle, box] = -1
@@ -239,7 +239,7 @@ def clear_box(state: Any, world: int, vehicle: int, box: int):
 
 @device_function
 def clear_entries(model: Any, state: Any, world: int, vehicle: int):
-    """Clear all that a vehicle has measured and received."""
+    """Clear a vehicle's measurements and received messages."""
     for entry in range(state.sight.shape[2]):
         clear_entry(state, world, vehicle, entry)
     for box in range(state.inbox_tick.shape[2]):
@@ -257,7 +257,7 @@ def clear_entries(model: Any, state: Any, world: int, vehicle: int):
 
 @device_function
 def camera_reach(model: Any, state: Any, world: int, vehicle: int):
-    """Return how far from a vehicle an agent may be that its camera sees, m."""
+    """Return the largest distance (m) of an agent that a vehicle's camera can see."""
     camera = model.camera[vehicle]
     place = camera.position + state.camera_shift[world, vehicle]
     reach = camera.range * state.parameter[world, CAMERA_RANGE] + wp.length(place) + model.marker_reach
@@ -293,7 +293,7 @@ def place_of_farthest(model: Any, state: Any, world: int, vehicle: int, seen: An
 
 @device_function
 def keep(model: Any, state: Any, world: int, vehicle: int, agent: int, seen: Any):
-    """Keep an agent that is in range; that there was no room for one is noted until the next reset."""
+    """Keep an agent in range; a lack of room is noted until the next reset."""
     if entry_of(model, state, world, vehicle, agent) >= 0:
         return
     count = state.kept_count[world, vehicle]

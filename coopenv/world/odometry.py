@@ -99,7 +99,7 @@ def drift(model: Any, state: Any, world: int, vehicle: int, tick: int):
 
 @device_function
 def with_errors(model: Any, state: Any, world: int, vehicle: int, v: Any, w: Any):
-    """Return what wheels and gyro read, free of noise, where the body's twist is (v, w)."""
+    """Return the noise-free readings of wheels and gyro for a body twist (v, w)."""
     if model.noise[vehicle].lasting == 0:
         return v, w
     o = type(v)()

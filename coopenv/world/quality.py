@@ -36,13 +36,13 @@ def normalised_error_squared(I11: Any, L21: Any, I22: Any, e1: Any, e2: Any):
 
 
 COORDINATES = (Coordinates.RICCATI, Coordinates.LEFT, Coordinates.RIGHT)
-"""Places in it are the numbers of coordinates in the state."""
+"""Coordinates by their number in the state."""
 RICCATI, LEFT, RIGHT = (wp.constant(number) for number in range(len(COORDINATES)))
 
 
 @wp.func
 def observer_error(R: Any, position: Any, R_hat: Any, p_hat: Any, coordinates: int):
-    """Return the error that P is about, rad and m: (2 lambda, p - phat), of Rtilde = Rhat^T R and p = R^T pbar.
+    """Return the error with the covariance P, rad and m: (2 lambda, p - phat), of Rtilde = Rhat^T R and p = R^T pbar.
 
     A covariance stated in other coordinates is kept to first order, see `coopenv.estimation.poses.riccati_covariance`.
     Its error is brought here in the same way: terms of second order grow with the distance from the map's origin.
@@ -78,7 +78,7 @@ def position_covariance(P: Any, p_hat: Any):
 
 @wp.func
 def position_variance(P: Any, p_hat: Any):
-    """Return the trace of the covariance of the position error in the map, m^2: that along any axes."""
+    """Return the trace of the covariance of the position error in the map, m^2; it is the same along any axes."""
     return wp.max(wp.trace(position_covariance(P, p_hat)), p_hat.dtype(0.0))
 
 
@@ -94,7 +94,7 @@ def usable(model: Any, state: Any, world: int, vehicle: int, entry: int, target:
 
 @device_function
 def known_position(model: Any, state: Any, world: int, vehicle: int, entry: int, target: int):
-    """Return where an entry's agent is: a landmark's place on the map, or a neighbour's message (Rhat_j phat_j)."""
+    """Return the position of an entry's agent: a landmark on the map, or a neighbour's message (Rhat_j phat_j)."""
     if target < model.landmarks:
         return mapped_position(model, state, world, vehicle, target)
     box = box_of_entry(model, entry)
@@ -184,7 +184,7 @@ def sample_gramian(model: Any, state: Any, world: int, vehicle: int, tick: int):
 def gramian_smallest_eigenvalue(model: Any, state: Any, world: int, vehicle: int):
     """Return the smallest eigenvalue of (1/T) int Phi^T C^T C Phi dt over the sliding window; 0 before any data.
 
-    Where the window is a way, it is the mean over that.
+    For a window of a length, it is the mean over the distance.
     """
     G11 = state.gramian_11[world, vehicle, 0]
     G12 = state.gramian_12[world, vehicle, 0]
@@ -210,7 +210,7 @@ def cholesky_of(P: Any):
 
 @device_function
 def targets_in_view(model: Any, state: Any, world: int, vehicle: int) -> int:
-    """Return how many targets the vehicle measures in this frame."""
+    """Return the number of targets that the vehicle measures in this frame."""
     count = int(0)
     kept = model.kept
     for n in range(entry_count(model, state, world, vehicle)):

@@ -1,7 +1,7 @@
 """Counter-based random numbers (Philox4x32-7; Salmon, Moraes, Dror, Shaw, SC 2011) and the parameters of a world.
 
-A draw is a pure function of (seed, episode, index, subject, stream), so a world has the same noise whatever the
-batch size, the order of execution and the device. `index` is a tick or a sample number, `subject` packs the agents
+A draw is a pure function of (seed, episode, index, subject, stream), so a world's noise does not depend on the
+batch size, the order of execution or the device. `index` is a tick or a sample number, `subject` packs the agents
 concerned, and `stream` is one of the constants below.
 
 Parameters of a world are factors: drawn at a reset, dependent on the difficulty, or set.
@@ -79,7 +79,7 @@ def pair(vehicle: int, other: int) -> int:
 
 
 CELL_SHIFT = wp.constant(wp.uint32(28))
-"""Sixteen cells per axis: the first four bits of a word number the cell that the number drawn from it falls into."""
+"""Sixteen cells per axis: the first four bits of a word are the cell of the number drawn from it."""
 
 
 @wp.func
@@ -180,7 +180,7 @@ NOT_SET = -1.0
 
 @wp.func
 def draw_parameters(model: Any, state: Any, world: int):
-    """Draw the factors of a world, but for those that are set."""
+    """Draw the factors of a world that are not set."""
     level = state.difficulty[world]
     one = type(level)(1.0)
     for k in range(model.drawn.low.shape[0]):

@@ -35,7 +35,7 @@ from coopenv.world.route import direct_traffic, draw_route, go_straight, has_rou
 from coopenv.world.v2x import NOTHING, POSE_BYTES, draw_faults, first_tick_of, transmit
 
 ABSENT = wp.constant(-1)
-"""Value of `ended` of a vehicle that is not there in this episode."""
+"""Value of `ended` of a vehicle that is absent in this episode."""
 
 EVERY_VEHICLE = wp.constant(-1)
 """All vehicles of a world, as a subject of random numbers."""
@@ -70,7 +70,7 @@ def draw_presence(model: Any, state: Any, world: int):
 
 @wp.func
 def keep_one_vehicle(model: Any, state: Any, world: int):
-    """Keep one vehicle, driven if there is one, in an episode whose draw has none."""
+    """Keep one vehicle, a driven one if possible, in an episode without any drawn vehicle."""
     candidates = int(0)
     for agent in range(model.landmarks, model.agents):
         if model.motion.kind[agent] == DRIVEN or model.drawn.any_driven == 0:
@@ -92,7 +92,7 @@ ATTEMPTS = wp.constant(16)
 
 @wp.func
 def place_agent(model: Any, state: Any, world: int, agent: int):
-    """Draw the true start pose of one agent, and its route, and set its motion going; those before it are in place."""
+    """Draw the true start pose of one agent, and its route, and start its motion; earlier agents are in place."""
     vehicle = agent - model.landmarks
     if vehicle < 0:
         position = model.start.position[agent]
@@ -135,7 +135,7 @@ def draw_place(model: Any, state: Any, world: int, landmark: int):
 
 @wp.func
 def place_at(model: Any, state: Any, world: int, agent: int, position: Any, R: Any, attempt: int):
-    """Draw the true start pose of one agent about a given one and set its motion going."""
+    """Draw the true start pose of one agent about a given one and start its motion."""
     spread = model.start.position_spread[agent]
     o = type(position)()
     one = o.dtype(1.0)

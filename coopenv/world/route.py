@@ -2,11 +2,11 @@
 
 A route is a line of points (x, y, s) in the map frame, s the arc length from its first point, m. Beyond its ends it
 goes on straight: s is negative before the first point and above the length behind the last. At a reset a route is drawn
-among those of the vehicle, shifted sideways and bent, or leads straight to the goal.
+from the vehicle's routes, shifted sideways and bent, or leads straight to the goal.
 
 Traffic also follows the vehicle ahead and signals, and appears at its time. The longitudinal model is the intelligent
 driver model (Treiber, Hennecke and Helbing, Congested traffic states in empirical observations and microscopic
-simulations, Physical Review E 62, 2000); its numbers are those of city traffic in Treiber and Kesting, Traffic Flow
+simulations, Physical Review E 62, 2000); its parameters are from city traffic in Treiber and Kesting, Traffic Flow
 Dynamics, 2013, table 11.2. The steering is pure pursuit (Coulter, 1992).
 """
 
@@ -157,7 +157,7 @@ def is_past_end(model: Any, state: Any, world: int, vehicle: int, radius: Any) -
 TURN = wp.constant(6.283185307179586)
 
 AFTER_STARTS = wp.constant(1000)
-"""Draws of the shapes of later routes are numbered from here on, those at a reset by its attempts."""
+"""First number of the draws of later routes' shapes; draws at a reset are numbered by its attempts."""
 
 
 @wp.func
@@ -202,7 +202,7 @@ def draw_route(model: Any, state: Any, world: int, vehicle: int, attempt: int):
 
 @wp.func
 def has_next_route(model: Any, state: Any, world: int, vehicle: int) -> bool:
-    """Return whether a route may follow that of a vehicle."""
+    """Return whether a route may follow a vehicle's route."""
     old = state.route_drawn[world, vehicle]
     row = model.drawn.next_row[vehicle]
     return old >= 0 and model.drawn.next_first[row, old + 1] > model.drawn.next_first[row, old]
@@ -210,7 +210,7 @@ def has_next_route(model: Any, state: Any, world: int, vehicle: int) -> bool:
 
 @wp.func
 def draw_next_route(model: Any, state: Any, world: int, vehicle: int):
-    """Draw the route of a vehicle that has arrived, among those that start where its old one ends."""
+    """Draw the next route of an arrived vehicle, from the routes that start at the end of the old one."""
     old = state.route_drawn[world, vehicle]
     arrival = state.arrivals[world, vehicle]
     row = model.drawn.next_row[vehicle]
@@ -271,7 +271,7 @@ def go_straight(model: Any, state: Any, world: int, vehicle: int):
         add_point(state, world, vehicle, 0, start[0], start[1])
         add_point(state, world, vehicle, 1, goal[0], goal[1])
         if state.route[world, vehicle, 1][2] == goal.dtype(0.0):
-            count = int(0)  # it is there
+            count = int(0)  # the vehicle is present
     state.goal[world, vehicle] = goal
     state.route_count[world, vehicle] = count
     state.route_drawn[world, vehicle] = -1
@@ -357,7 +357,7 @@ def gap_ahead(model: Any, state: Any, world: int, vehicle: int, s: Any, front: A
 def gap_to_signal(model: Any, state: Any, world: int, vehicle: int, s: Any, tick: int):
     """Return the gap (m) that lets a vehicle whose front is at arc length `s` stop at a red signal; 1e6: it goes on.
 
-    It goes on where it cannot stop any more. A front just beyond the line stops as well.
+    A vehicle that cannot stop any more goes on. A front just beyond the line stops as well.
     """
     route = state.route_drawn[world, vehicle]
     gap = model.routes.signal_at[route] - s + type(s)(STANDSTILL_GAP)
@@ -398,7 +398,7 @@ def direct_traffic(model: Any, state: Any, world: int, vehicle: int, tick: int):
 
 @device_function
 def is_room(model: Any, state: Any, world: int, vehicle: int) -> bool:
-    """Return whether no other vehicle is near one that is to appear."""
+    """Return whether no other vehicle is near a vehicle that is to appear."""
     here = state.position[world, model.landmarks + vehicle]
     for other in range(model.landmarks, model.agents):
         if state.present[world, other] == 1 and wp.length(state.position[world, other] - here) < here.dtype(NEAR):
@@ -408,7 +408,7 @@ def is_room(model: Any, state: Any, world: int, vehicle: int) -> bool:
 
 @device_function
 def appear(model: Any, state: Any, world: int, tick: int):
-    """Let vehicles appear whose time has come and near whose start there is none; the others have moved already."""
+    """Let due vehicles appear if no vehicle is near their start; the others have moved already."""
     for vehicle in range(model.vehicles):
         agent = model.landmarks + vehicle
         if state.present[world, agent] == 0 and state.ended[world, vehicle] == UNDER_WAY:

@@ -2,12 +2,12 @@
 
 W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders), M odometry samples a tick, S slots of
 the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q parameters, U numbers of an action, Z bodies
-of the traffic, G cells of the grid, I items in it. What is measured and received has
+of the traffic, G cells of the grid, I items in it. Measurements and messages have
 X entries, one per agent, and Y boxes, one per sender, or as many as are kept (V), see `coopenv.world.nearby`; E agents
 that may be off on maps. L lanes of scratch: indexed by vehicle, shared by the vehicles that one thread takes in turn.
 
-A field of a record states its axes once, a letter each, and is allocated by them. It states the rule of what a saved
-state may hold there, too; all rules are checked before anything is restored.
+A field of a record states its axes once, a letter each, and is allocated by them. It also states the rule of its saved
+values; all rules are checked before anything is restored.
 """
 
 import math
@@ -39,7 +39,7 @@ from coopenv.world.warp_internals import field_types, struct_of
 def array(axes: str, dtype: Any, rule: Rule | None = None) -> Any:
     """Return the annotation of a struct's field: an array with these axes, a letter each, for example "WN".
 
-    What a saved state may hold there is its rule; numbers of a field without one have to be finite.
+    Its rule limits a saved state; numbers of a field without a rule have to be finite.
     """
     annotation: Any = wp.array(dtype=dtype, ndim=len(axes))
     annotation.axes, annotation.rule = axes, rule
@@ -64,8 +64,8 @@ def size_of(record: Any, sizes: Mapping[str, int]) -> int:
 def allocate(record: Any, sizes: Mapping[str, int], device: str, shared: str = "", interleaved: bool = False) -> Any:
     """Return a record of zeros of a struct whose fields are declared with `array`; `sizes` are lengths by letter.
 
-    Along the axes in `shared`, where they come second, all indices stand for one and the same row: whoever needs the
-    rows of one vehicle can then index them by the vehicle without memory for the other vehicles. If `interleaved`, the
+    Along the axes in `shared`, where they come second, all indices stand for the same row: functions of
+    one vehicle can then index its rows by the vehicle without memory for the other vehicles. If `interleaved`, the
     first axis, that of the worlds, varies fastest in memory.
     """
     result = record()
@@ -144,7 +144,7 @@ def _paths(dtype: np.dtype) -> Iterator[tuple[str, ...]]:
 
 
 def repeated(row: Any, axis: int, count: int) -> Any:
-    """Return an array that has one entry along an axis as one that seems to have it `count` times."""
+    """Return a view of an array that repeats its single entry along an axis `count` times."""
     shape, strides = list(row.shape), list(row.strides)
     shape[axis], strides[axis] = count, 0
     result: Any = wp.array(ptr=row.ptr, shape=tuple(shape), strides=tuple(strides), dtype=row.dtype, device=row.device)
@@ -180,7 +180,7 @@ LEVELS = Rule("at least 0", lambda values, fields, model: values >= 0.0)
 
 
 def _odometry_samples(values: Array, fields: Fields, model: Any) -> Mask:
-    """Return which counts are those of the tick, at which sample m has been taken if m / rate is not later."""
+    """Return flags of valid counts at the tick; sample m has been taken if m / rate is not later."""
     due = fields["tick"][:, None] * (model.camera_period * model.odometry_rate)
     return np.asarray((values >= 0) & (np.abs(values - due) <= 2.0))
 
@@ -211,7 +211,7 @@ KEPT_ORDER = Rule("a number of an entry", lambda values, fields, model: (values 
 
 
 def _lists(values: Array, fields: Fields, model: Any) -> Mask:
-    """Return where no item is named twice, by cells and by items before it: all lists end then.
+    """Return flags of grids in which cells and items link to no item twice, so that all lists end.
 
     A grid of a single cell has none.
     """
@@ -238,12 +238,12 @@ COVARIANCE = Rule(
 def checked_state(
     values: Mapping[str, Any], arrays: Mapping[str, Any], rules: Mapping[str, Rule], model: Any, knows_truth: bool
 ) -> dict[str, Array]:
-    """Return copies of what a state holds, in the types of the Warp arrays, by name, that it is to be written to.
+    """Return copies of a state's values in the types of the Warp arrays, by name, that they are to be written to.
 
     Numbers of a field without a rule have to be finite; `knows_truth` says whether the truth is always there.
 
     Raises:
-        CoopenvError: a field is missing, has another shape or type, or an element is not what its rule says.
+        CoopenvError: a field is missing, has another shape or type, or an element breaks its rule.
     """
     fields = {name: _converted(name, values, target.numpy()) for name, target in arrays.items()}
     begun = has_begun(fields["start_rotation"])
@@ -259,7 +259,7 @@ def checked_state(
 
 
 def has_begun(start_rotation: Array) -> Mask:
-    """Return (W,) which worlds have been reset; before that, their fields are zero."""
+    """Return flags (W,) of worlds that have been reset; before, their fields are zero."""
     return np.asarray(start_rotation.reshape(len(start_rotation), -1).any(axis=1))
 
 
@@ -287,7 +287,7 @@ def state_struct(p: Precision) -> Any:
 
     @wp.struct
     class State:
-        """Everything that changes. Lengths in m, angles in rad, map and body frames as named."""
+        """All variables of the worlds. Lengths in m, angles in rad, map and body frames as named."""
 
         seed: array("W", wp.uint64, ANYTHING)
         episode: array("W", wp.uint32, ANYTHING)
@@ -317,7 +317,7 @@ def state_struct(p: Precision) -> Any:
         steering: array("WN", scalar, numbers(1.6))  # rad
         pan: array("WN", scalar, numbers(3.15))  # angle by which the camera is turned to the left, rad
         action: array("WNU", scalar, numbers(1.001))  # of the current decision, in [-1, 1]
-        command: array("WN", vec4)  # what it asks for: speed m/s, steering rad, acceleration m/s^2, pan rad
+        command: array("WN", vec4)  # target: speed m/s, steering rad, acceleration m/s^2, pan rad
         last_command: array("WN", vec4)  # of the decision before, in force during the dead time
         ended: array("WN", wp.int32, whole(-1, "last_outcome"))  # `Outcome`, then the scenario's own conditions
         collided: array("WN", wp.int32, FLAG)  # touching something now
@@ -364,7 +364,7 @@ def state_struct(p: Precision) -> Any:
         outbox_content: array("WNSH", wp.int32, whole(0, 2))  # per receiver: nothing, the pose alone, the whole report
         report_size: array("WN", wp.int32, whole(0, 10**6))  # bytes of the last report
         bytes_sent: array("WN", wp.int32, whole(0, 10**9))  # since the last decision
-        arriving: array("WNY", wp.int32, TICK)  # per receiver and box: tick of sending of what arrives; -1: nothing
+        arriving: array("WNY", wp.int32, TICK)  # per receiver and box: sending tick of the arriving message; -1: none
         inbox_rotation: array("WNY", mat33, ROTATION)  # per receiver and box
         inbox_position: array("WNY", vec3)  # map
         inbox_tick: array("WNY", wp.int32, TICK)  # tick of sending; -1: nothing received
@@ -403,7 +403,7 @@ def state_struct(p: Precision) -> Any:
 LASTING_ERRORS = ("odometry_scale", "gyro_bias", "slip", "camera_turn", "camera_shift")
 """Fields with the true errors of a vehicle's sensors, see `coopenv.world.odometry`; beside `camera_focal`."""
 FAULTS = ("clock", "restart_tick", "lie_tick", "jammer_tick", "map_tick", "map_error")
-"""Fields with what goes wrong with a vehicle's clock, computer, messages and map, see `coopenv.world.v2x`."""
+"""Fields of faults of a vehicle's clock, computer, messages and map, see `coopenv.world.v2x`."""
 
 
 def state_sizes(model: Any, worlds: int) -> dict[str, int]:

@@ -1,11 +1,11 @@
-"""The pipeline of one camera tick as kernels: those of a source of ticks, and those of an observer.
+"""The pipeline of one camera tick as kernels of a source of ticks, and kernels of an observer.
 
 An episode starts with `begin`. A decision is `decide`, then per tick `sense` (the source) and `follow` (the observer:
 receive, estimate, send). Neither knows the other, so that each is compiled once per precision. For a small observer of
 simulated worlds (`Embedded.fused`) one kernel, `advance`, runs all ticks of a decision without leaving a world.
 
 A thread takes a world with all its vehicles, or every `lanes`-th vehicle of a world. The stages of `sense` are then
-launches of their own, and so is `finish`. `follow` is launched once, as what is received has been sent at earlier
+launches of their own, and so is `finish`. `follow` is launched once, because received messages were sent at earlier
 ticks; or, without a delay of the radio, level by level (`Turns`). On a GPU it is a kernel for each part of a large
 observer: one for all takes minutes to compile and several kilobytes of stack per thread.
 """
@@ -38,7 +38,7 @@ def is_active(model: Any, state: Any, hold: Any, world: int) -> bool:
 
 @device_function
 def finish_tick(model: Any, state: Any, world: int, tick: int):
-    """Put a decision that is over on record, and count the tick."""
+    """Record a decision that is over, and count the tick."""
     if tick % model.ticks_per_decision == 0 or tick == model.horizon_ticks:
         for vehicle in range(model.vehicles):
             state.last_command[world, vehicle] = state.command[world, vehicle]
@@ -60,7 +60,7 @@ class Turns:
 
 MOVE, ARRANGE, LOOK = 1, 2, 4
 SENSE = MOVE | ARRANGE | LOOK
-"""Stages of `sense`: those of a source of ticks."""
+"""Stages of `sense`, from the source of ticks."""
 
 
 @cache
@@ -156,7 +156,7 @@ def follow_kernels(observer: Embedded, p: Precision, in_parts: bool) -> list[wp.
 
 
 def _begin(source: Source, p: Precision) -> Any:
-    """Return the function of the kernel that starts the next episode in every world whose mask is set.
+    """Return the function of the kernel that starts the next episode in the worlds of the mask.
 
     Observers start then. It shares most functions with the kernels that sense, and so their modules.
     """
@@ -199,7 +199,7 @@ def source_kernels(source: Source, p: Precision) -> Kernels:
 
 @cache
 def observer_kernels(observer: Embedded, p: Precision) -> Kernels:
-    """Return the stages of an embedded observer: `follow`, `start` and `revive`; and in float64 those of one vehicle.
+    """Return the stages of an embedded observer: `follow`, `start` and `revive`; and float64 stages of one vehicle.
 
     The latter serve observers that are plug-ins (`coopenv.observers.kernel_observer`).
     """
@@ -306,7 +306,7 @@ def host_kernels(p: Precision) -> Kernels:
             deliver(model, state, world, vehicle, state.tick[world] + 1)
 
     def broadcast(model: Model, state: State, hold: Hold, vehicle: int):
-        """Take what has been written as the vehicle's estimate, and send it. One thread per world."""
+        """Use the written values as the vehicle's estimate, and broadcast it. One thread per world."""
         world = wp.tid()
         if is_active(model, state, hold, world):
             tick = state.tick[world] + 1

@@ -1,7 +1,7 @@
-"""V2X: pose estimates travel with delay, period, loss and limited range; faults change what is sent.
+"""V2X: pose estimates travel with delay, period, loss and limited range; faults change the messages.
 
 Faults of computers, clocks, maps and messages are drawn at a reset. With all of them off, nothing is drawn and nothing
-is changed. A message has two times besides that of its sending: that of its content (`content_tick`, earlier where the
+is changed. Besides the time of sending, a message has two times: its content's (`content_tick`, earlier where the
 sender replays) and its time stamp (`stamp`), wrong by the clocks' offsets.
 """
 
@@ -42,7 +42,7 @@ MOST_CLOCK_TICKS = wp.constant(1.0e8)
 
 @wp.func
 def draw_faults(model: Any, state: Any, world: int, vehicle: int):
-    """Draw what goes wrong with a vehicle in an episode."""
+    """Draw the faults of a vehicle in an episode."""
     o = type(state.broadcast_shift[world, vehicle])()
     state.clock[world, vehicle] = 0
     state.restart_tick[world, vehicle] = NEVER
@@ -77,7 +77,7 @@ def first_tick_of(model: Any, start: Any, spread: Any, word: wp.uint32) -> int:
 
 @wp.func
 def drawn_direction(given: Any, word: wp.uint32):
-    """Return a direction of length 1: the given one, or a horizontal one that is drawn if that is zero."""
+    """Return a direction of length 1: the given one, or if that is zero a drawn horizontal one."""
     direction = given
     if wp.length_sq(given) == given.dtype(0.0):
         angle = given.dtype(6.283185307179586) * uniform(word, given.dtype(1.0))
@@ -110,7 +110,7 @@ def draw_restart(model: Any, state: Any, world: int, vehicle: int, o: Any):
 
 @wp.func
 def draw_lie(model: Any, state: Any, world: int, vehicle: int, o: Any):
-    """Draw from which tick a vehicle lies, and what it adds to its position; of all that collude the same."""
+    """Draw the tick from which a vehicle lies, and its offset of the position, equal for all colluding vehicles."""
     fault = model.fault[vehicle]
     subject = wp.where(fault.lie == COLLUDE, model.vehicles, vehicle)
     words = random_words(state.seed[world], state.episode[world], 0, subject, LIE)
@@ -133,7 +133,7 @@ def draw_jammer(model: Any, state: Any, world: int, vehicle: int, o: Any):
 
 @wp.func
 def draw_map_error(model: Any, state: Any, world: int, vehicle: int, landmark: int, o: Any):
-    """Draw from which tick a landmark is off on a vehicle's map, and by how much; the same for all vehicles."""
+    """Draw the tick from which a landmark is off on a vehicle's map, and the offset; the same for all vehicles."""
     fault = model.fault[vehicle]
     one = o.dtype(1.0)
     words = random_words(state.seed[world], state.episode[world], 0, landmark, MAP_ERROR)
@@ -147,13 +147,13 @@ def draw_map_error(model: Any, state: Any, world: int, vehicle: int, landmark: i
 
 @wp.func
 def is_lying(state: Any, world: int, vehicle: int, tick: int) -> bool:
-    """Return whether what a vehicle sends at a tick is a lie."""
+    """Return whether a vehicle's message of a tick is a lie."""
     return state.lie_tick[world, vehicle] >= 0 and tick >= state.lie_tick[world, vehicle]
 
 
 @wp.func
 def alter(model: Any, state: Any, world: int, vehicle: int, tick: int):
-    """Decide by what the pose that a vehicle broadcasts at a tick differs from its estimate."""
+    """Decide the difference between a vehicle's broadcast pose and its estimate at a tick."""
     if model.alters == 0:
         return
     fault = model.fault[vehicle]
@@ -235,7 +235,7 @@ def stamp(model: Any, state: Any, world: int, receiver: int, sender: int, sent: 
 
 @wp.func
 def forget_everything(model: Any, state: Any, world: int, vehicle: int):
-    """Reset a vehicle that restarts to what its computer knows: the map alone.
+    """Reset a restarting vehicle to the knowledge of its computer: the map alone.
 
     Its estimate is the mean of the landmarks, in the map's axes; its inbox is empty.
     """
@@ -298,7 +298,7 @@ def broadcast(model: Any, state: Any, world: int, vehicle: int, tick: int):
 
 @device_function
 def chosen_content(model: Any, state: Any, world: int, vehicle: int, receiver: int) -> int:
-    """Return what a vehicle sends to a receiver by its action; without `action.radio` the whole report."""
+    """Return the contents of a vehicle's message to a receiver by its action; without `action.radio`, REPORT."""
     if receiver == vehicle:
         return NOTHING
     content = REPORT
@@ -311,7 +311,7 @@ def chosen_content(model: Any, state: Any, world: int, vehicle: int, receiver: i
 
 @device_function
 def count_bytes(model: Any, state: Any, world: int, vehicle: int, tick: int):
-    """Count what a vehicle has sent at a tick, after its estimator has said how large its report is."""
+    """Count a vehicle's messages of a tick, after its estimator has set the size of its report."""
     slot = tick % model.radio.slots
     if state.outbox_tick[world, vehicle, slot] != tick:
         return
@@ -409,7 +409,7 @@ def is_lost(model: Any, state: Any, world: int, receiver: int, sender: int, tick
 
 @device_function
 def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
-    """Receive what arrives at this tick, where it has been sent, and decide what the own message claims."""
+    """Receive the messages arriving at this tick, and decide the claims of the own message."""
     alter(model, state, world, receiver, tick)
     for box in range(state.arriving.shape[2]):
         sent = state.arriving[world, receiver, box]

@@ -6,7 +6,7 @@
 | `device_function`, `subroutine` | `Function.__class__`, `inline_hint`, `overload.adj` | records by reference |
 | `struct_of`, `field_types` | `StructInstance._cls`, `Struct.vars` | fields of a record |
 | `scalar_of` | `_wp_scalar_type_` | the NumPy type of an array of vectors |
-| `kernel_hashes` | `context.user_modules`, `Module.get_module_hash` | what a report of a run was computed with |
+| `kernel_hashes` | `context.user_modules`, `Module.get_module_hash` | versions of kernels in a report of a run |
 | `_kernel_source` | `codegen.codegen_kernel`, `Adjoint.args` | no copies of records; no kernels of the host on CUDA |
 | `_function_source` | `codegen.codegen_func`, `codegen.cpu_module_header` | CPU: indices and loops as in C |
 """
@@ -56,7 +56,7 @@ def _as_handed(kind: Any) -> Any:
 
 
 def _has_arrays(kind: Any) -> bool:
-    """Return whether a type is a `wp.struct` with arrays, its own or those of a struct in it."""
+    """Return whether a type is a `wp.struct` with arrays, its own or a nested struct's."""
     fields = getattr(kind, "vars", {}).values()
     return any(isinstance(field.type, wp.array) or _has_arrays(field.type) for field in fields)
 
@@ -102,7 +102,7 @@ _generate: Any = codegen.codegen_kernel
 
 
 def _kernel_source(kernel: Any, device: str, options: Mapping[str, Any]) -> str:
-    """Return the source of a kernel of this package, which reads records of arrays from where the launch puts them.
+    """Return the source of a kernel of this package, which reads records of arrays in place.
 
     Warp copies them for every thread, some kilobytes. No kernel writes to one. On CUDA a parameter whose address is
     taken is copied into local memory, too, unless it is a `__grid_constant__`.
@@ -135,7 +135,7 @@ def host_only(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def device_function(function: Callable[..., Any]) -> Any:
-    """Return what `wp.func` makes of a function, with structs of arrays by reference.
+    """Return the Warp function of a Python function, with structs of arrays by reference.
 
     Such a struct has some kilobytes, as every array has a descriptor. Warp hands functions copies of their arguments,
     which the compiler removes from small functions alone; in an observer of many functions the copies take a fifth of

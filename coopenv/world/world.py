@@ -57,7 +57,7 @@ BY_AGENT = {
     **dict.fromkeys(("arriving", "inbox_tick", "inbox_stamp"), -1),
     **dict.fromkeys(("inbox_rotation", "inbox_position"), 0.0),
 }
-"""Fields of what is measured and received, and their values for an agent that is not kept."""
+"""Fields of measurements and messages, and their values for an agent that is not kept."""
 Keys = Sequence[int | None] | np.ndarray | None
 Options = Mapping[str, Any] | None
 
@@ -65,8 +65,8 @@ Options = Mapping[str, Any] | None
 class World:
     """`worlds` copies of one scenario, stepped together.
 
-    What is drawn in a world depends on its key alone (`coopenv.base.errors`): it is bit for bit the single world with
-    that key (on the same device).
+    The draws of a world depend on its key alone (`coopenv.base.errors`): it is bit for bit the single world with that
+    key (on the same device).
     """
 
     source: Source = SIMULATED  # where its ticks come from
@@ -84,13 +84,13 @@ class World:
         """Build the arrays; call `reset` before `advance`.
 
         Args:
-            scenario: what to build.
-            worlds: how many.
+            scenario: scenario of all worlds.
+            worlds: number of worlds.
             dtype: "float32" or "float64".
             device: "cpu", "cuda", "cuda:0", ...
             threads: shares into which the batch, or each of its worlds, is split on the CPU; None: by size and cores
                 (`threads_and_lanes`). Results do not depend on it.
-            observer: what estimates in the kernels (none by default: the estimates are written from outside).
+            observer: observer in the kernels (none by default: the estimates are written from outside).
             start_covariance: (N, 6, 6) of the initial estimates, for the observer; LEFT coordinates, rad and m.
 
         Raises:
@@ -135,7 +135,7 @@ class World:
         self._set_due(0, 1)
         by_level = self.device != "cpu" and lanes == 1 and self.in_parts
         self._levels = [self._turns_of_level(level) for level in range(N if by_level else 0)]
-        """Turns for every level that there could be; none where levels are looked up."""
+        """Turns of all possible levels; none where levels are found on the device."""
         self._record = self._build_record()
         self.actions = wp.zeros((worlds, N, self.model.action_size), dtype=self.precision.scalar, device=self.device)
         self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
@@ -147,11 +147,11 @@ class World:
         return build_model(self.scenario, self.precision, self.device)
 
     def _build_record(self) -> Any:
-        """Return what the source of ticks reads."""
+        """Return the record that the source of ticks reads."""
         return Nothing()
 
     def set_parameters(self, values: Mapping[str, np.ndarray], worlds: np.ndarray) -> None:
-        """Set what the next resets of the worlds of a mask (W,) make of parameters, until it is set again.
+        """Set the parameters of the next resets of the worlds of a mask (W,), until the next call.
 
         Args:
             values: (W,) by name: factors of the scenario's parameters (NaN: drawn again), and `difficulty`.
@@ -250,7 +250,7 @@ class World:
             self.finish()
 
     def _follow_by_level(self) -> None:
-        """Let vehicles follow, those of a large level at once; small levels are not worth the handing over."""
+        """Let vehicles follow, the vehicles of a large level in parallel; small levels are not worth the overhead."""
         self._run("levels", host_kernels(self.precision)["find_levels"], PerWorld(self.mask), PerWorld(self._turns))
         for level, turns in enumerate(self._levels):  # idle launches cost less than to wait for the GPU
             self.launch.by_lane(("follow", level), *self._follow(turns=turns))
@@ -268,14 +268,14 @@ class World:
                     self.launch(("follow in turn", n), follow, [*arguments, 0, 1], (1,))
 
     def _set_due(self, first: int, last: int) -> None:
-        """Set the levels whose vehicles follow next."""
+        """Set the levels that follow next."""
         if self.device == "cpu":
             self._turns.due.numpy()[...] = first, last
         else:
             self._turns.due.assign(np.full((self.worlds, 2), (first, last), dtype=np.int32))
 
     def _turns_of_level(self, level: int) -> Any:
-        """Return turns that share everything with those of the world but the level that is due."""
+        """Return turns that share everything with the world's but the level that is due."""
         result = Turns()
         for name in field_types(self._turns):
             setattr(result, name, getattr(self._turns, name))
@@ -302,7 +302,7 @@ class World:
         self.launch("arrange", arrange, [*arguments, 0, 1], (1,))
 
     def check_room(self) -> None:
-        """Make sure that all vehicles have kept what was in range in this episode; a reset warns of it on a GPU.
+        """Check that all vehicles have kept all agents in range in this episode; a reset warns of it on a GPU.
 
         Raises:
             CoopenvError: the scenario's limit is too low.
@@ -316,7 +316,7 @@ class World:
             warnings.warn(line, ScenarioWarning, stacklevel=3)
 
     def load(self) -> None:
-        """Load the kernels, compiling those that this machine has not compiled yet; nothing moves."""
+        """Load the kernels, compiling the missing ones; nothing moves."""
         self.restart()
         self.mask.fill_(1)
         World.advance(self, 1)
@@ -342,7 +342,7 @@ class World:
             self.launch.by_lane("look", self._sense(LOOK))
 
     def receive(self, vehicle: int) -> None:
-        """Let a vehicle receive what arrives at this tick."""
+        """Let a vehicle receive the messages arriving at this tick."""
         self._run(("receive", vehicle), host_kernels(self.precision)["receive"], PerWorld(self.mask), vehicle)
 
     def broadcast(self, vehicle: int) -> None:
@@ -356,7 +356,7 @@ class World:
     def view(self, name: str) -> np.ndarray:
         """Return a field of the state on the host, without a copy on the CPU.
 
-        Where vehicles keep those nearby, what is measured and received is copied: (W, N, A) or (W, N, N), as otherwise.
+        Where vehicles keep nearby agents, measurements and messages are copied: (W, N, A) or (W, N, N), as otherwise.
         """
         if name in BY_AGENT and self.model.kept:
             return self._by_agent(name)
@@ -375,11 +375,11 @@ class World:
         return values
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """Return a copy of everything that changes, random streams included (they are seeds and counters)."""
+        """Return a copy of all variables, random streams included (they are seeds and counters)."""
         return {name: array.numpy().copy() for name, array in self.state_arrays().items()}
 
     def set_state(self, values: Mapping[str, np.ndarray]) -> None:
-        """Restore what `get_state` returned; a CoopenvError names a field that is not so, and nothing has changed."""
+        """Restore a state of `get_state`; a CoopenvError names an invalid field, and nothing has changed."""
         overwrite(self.state_arrays(), self.checked_state(values, {}, {}))
 
     def checked_state(
@@ -390,7 +390,7 @@ class World:
         return checked_state(values, arrays, {**self.state_rules(), **rules}, self.model, self.source.knows_truth)
 
     def state_rules(self) -> dict[str, Rule]:
-        """Return what the fields of a saved state may hold, by name."""
+        """Return the rules of the fields of a saved state, by name."""
         own = {name: field.rule for name, field in state_fields(self.precision).items() if field.rule is not None}
         of_observer = {f"observer_{name}": rule for name, rule in self.observer.valid.items()}
         return {**own, **of_observer, "actions": ANYTHING}

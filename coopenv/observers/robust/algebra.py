@@ -82,7 +82,7 @@ def recentring(error: Any):
 
 @wp.func
 def by_rows(H: Any, M: Any):
-    """Return H M for a 2x6 matrix H and a 6x6 matrix M: by rows, which compilers make vector operations of."""
+    """Return H M for a 2x6 matrix H and a 6x6 matrix M, by rows, which compilers vectorise."""
     return wp.matrix_from_rows(
         H[0, 0] * M[0] + H[0, 1] * M[1] + H[0, 2] * M[2] + H[0, 3] * M[3] + H[0, 4] * M[4] + H[0, 5] * M[5],
         H[1, 0] * M[0] + H[1, 1] * M[1] + H[1, 2] * M[2] + H[1, 3] * M[3] + H[1, 4] * M[4] + H[1, 5] * M[5],
@@ -151,7 +151,7 @@ def between(before: Pose, after: Pose):
 
 @wp.func
 def forward(step: Pose, M: Any):
-    """Return F M for a matrix M of six rows: by rows, a fourth of the time that the product of two takes.
+    """Return F M for a matrix M of six rows: by rows, in a fourth of the time of a full product.
 
     F = [[E, 0], [-E [p]x, E]] with E = R^T is the transition of the left error over an increment (R, p) of odometry.
     """
@@ -239,7 +239,7 @@ def is_known(P: Any):
 def is_regular(M: Any, inverse: Any, most: Any):
     """Return whether tr(M) tr(M^-1) of a positive definite M, 6x6, is below `most`; False for NaN.
 
-    That is at least the condition number, the ratio of the largest eigenvalue to the smallest, and at most 36 times it.
+    The product is at least the condition number and at most 36 times it.
     """
     return wp.trace(M) * wp.trace(inverse) < most
 

@@ -1,4 +1,4 @@
-"""Constants of the filter with their units; "Chosen" and "Tuned" mark those that do not follow from a model."""
+"""Constants of the filter with their units; "Chosen" and "Tuned" mark constants that do not follow from a model."""
 
 import math
 
@@ -15,17 +15,17 @@ MAX_CONDITION = 1.0 / SINGLE**2  # of the information of a frame; from there on 
 MIN_VARIANCE = 1e-14  # rad^2 and m^2, below which a covariance is malformed: 0.1 um
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
 SHORT_TIME, MEAN_TIME, LONG_TIME = 0.5, 1.0, 2.0
-"""s. Short: of a block of the monitors; after which a silent sender may restart; for which a hypothesis is
-tracked at least. Mean: of recent means; for which calibration errors and those of messages are the same in all frames;
-after which what is out of view is given up first. Long: for which an excluded source stays so, most bearings
-may fail the gate before a search begins, and a search requires well determined solutions. Chosen."""
+"""Times, s. Short: block of the monitors; silence after which a sender may restart; least tracking of a hypothesis.
+Mean: window of recent means; duration of errors of calibration and of messages; time out of view after which sources
+are evicted first. Long: least exclusion of a source; time for which most bearings may fail the gate before a search,
+and for which a search requires well determined solutions. Chosen."""
 
 # Belief
 
 MAX_MEMBERS = 5  # vehicles in a belief, the vehicle itself included, calibration states excluded
 MAX_ITERATIONS = 8  # of one correction, and of the least squares from one frame. Chosen
 LINEAR_ANGLE = 0.05
-"""rad: largest turn of a line of sight without another linearisation, and largest standard deviation of a sender's
+"""Largest turn (rad) of a line of sight without another linearisation, and largest standard deviation of a sender's
 position, as an angle in view, for which its increments are applied. Tuned."""
 LINEARISATION_TIME, CONSIDERED_LINEARISATION_TIME = 0.1, 12.0
 """Correlation time of a bearing's linearisation error, s; all frames of that time count as one: for a
@@ -33,7 +33,7 @@ landmark, and for another vehicle, whose error no later bearing corrects. Tuned.
 MAX_ACCELERATION = 1.0  # m/s^2 by which a member may leave its last known twist. Chosen: an ordinary start or stop
 MAX_SMOOTH_ACCELERATION = 10.0  # m/s^2 and rad/s^2: largest one by brakes and steering. Chosen
 MIN_VELOCITY_STD, MIN_ANGULAR_VELOCITY_STD = 2e-3, 2e-4
-"""m/s and rad/s, of an odometry sample: the increments of a moving vehicle are never exact."""
+"""Least standard deviations of an odometry sample, m/s and rad/s: a moving vehicle's increments are never exact."""
 JUMP_GATE = 2.0 * float(chdtri(3, RISK))  # of the squared change of a twist between samples, in sample variances
 SHARE_OF_CHANGE = 0.2  # of a velocity, by which it must change before the effect of clock offsets is updated. Chosen
 CALIBRATION_CHANGE = 0.02
@@ -41,14 +41,14 @@ CALIBRATION_CHANGE = 0.02
 second, as a share of its declared deviation. Without turns, heading and mounting are not separately observable, and
 linearisation makes both covariances slightly too small. Tuned."""
 GYRO_BIAS, GYRO_BIAS_WALK = 1e-3, 1e-4
-"""rad/s per axis, and rad/s in the root of a second: least deviation of a gyro's bias and of its walk, where no larger
-ones are declared. The walk is tuned, from 2e-5 to 1e-3: the largest costs half of the accuracy without a fault."""
+"""Least deviation of a gyro's bias (rad/s per axis) and of its walk (rad/s per root of a second), unless larger ones
+are declared. The walk is tuned, from 2e-5 to 1e-3: the largest costs half of the accuracy without a fault."""
 
 # Monitors
 
 FAULT_GATE, FAULT_RISK = 35.0, 1e-2
-"""Ratio, twice its logarithm, from which the fault of a source is likelier than none; probability that the source that
-is excluded is right. Tuned: in honest worlds the largest of all ratios was 34, with 30 % of the messages lost 48."""
+"""Gate of twice the logarithm of a fault's likelihood ratio to no fault; probability that the excluded source
+is correct. Tuned: in honest worlds the largest of all ratios was 34, with 30 % of the messages lost 48."""
 ODDS = -2.0 * math.log(FAULT_RISK)  # difference of such ratios at which one hypothesis is nearly certain
 MONITOR_TIME = 10.0  # s: time constant of the sums of a monitor. Chosen
 OWN_FAULT = 0.1  # deviation of a fault of velocity, as a share of it, gyro, rad/s, and camera, rad. Chosen
@@ -79,7 +79,7 @@ MASK_BITS = 64  # vehicles in a mask; numbers from 64 on share bits with lower o
 # Search
 
 KNOWN_ANGLE, KNOWN_POSITION = 0.2, 2.0
-"""rad and m: standard deviation per axis below which a pose is a linearisation point and is sent. Chosen."""
+"""Standard deviation per axis (rad and m) below which a pose is a linearisation point and is broadcast. Chosen."""
 MAX_HYPOTHESES = 6  # most hypotheses at once: P3P has four solutions at most, the prior is one more. Chosen
 MARGIN = 2.0
 """Standard deviations by which measurements are perturbed to find solutions that noise removes; factor of a neighbour's

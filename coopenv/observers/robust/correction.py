@@ -57,7 +57,7 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, projecti
     """Find the correction by all bearings that fit, without a change of the covariance.
 
     A sequential update with the residuals that the earlier bearings leave equals the batch update. Rejected bearings
-    correct nothing; for the monitors, their innovation is limited to the gate. Considered members are not corrected.
+    correct nothing; the monitors limit their innovation to the gate. Considered members are not corrected.
 
     Returns:
         The largest NIS of a bearing that fits, given the earlier ones, and the sum of all.
@@ -121,7 +121,7 @@ def gate_jointly(memory: Any, world: int, i: int, bearings: int):
 
 @subroutine
 def update_covariance(memory: Any, world: int, i: int, bearings: int):
-    """Update the covariance by the bearings that fit; that of considered errors stays."""
+    """Update the covariance by the bearings that fit; the covariance of considered errors stays."""
     for k in range(memory.belief[world, i].first_sender):
         for j in range(k, memory.belief[world, i].members):
             block = mat66d()

@@ -196,9 +196,9 @@ def sender_reset_detected(memory: Any, world: int, i: int, n: int, dt: Any) -> b
 
 @device_function
 def unknown_covariance(model: Any, memory: Any, world: int, i: int, n: int, step: Pose, dt: Any):
-    """Return the covariance (3, 3), m^2 and body, of an increment of member n over dt by what the receiver cannot know.
+    """Return the covariance (3, 3), m^2 and body, of an increment of member n over dt by the sender's unknown errors.
 
-    That is how wrong the scale of the sender's odometry is, and how suddenly its twist has changed.
+    These are the scale error of the sender's odometry, and sudden changes of its twist.
     """
     p = wp.transpose(step.R) * step.p
     declared = wp.float64(model.noise[i].odometry_scale)
@@ -248,7 +248,7 @@ def is_pending(model: Any, state: Any, memory: Any, world: int, i: int, n: int, 
 def should_follow_pending(model: Any, state: Any, memory: Any, world: int, i: int, n: int, tick: int) -> bool:
     """Return whether to fuse a report of member n after a pending one, so that broadcast correlations match reports.
 
-    Its correlations refer to another member's pending report, or those of a pending report to the previous report of n.
+    The correlations of n's report refer to the pending report, or the pending report's to the previous report of n.
     """
     sender = memory.member[world, i, n].vehicle
     before = memory.member[world, i, n].report.tick

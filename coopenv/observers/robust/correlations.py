@@ -6,7 +6,7 @@ message. If messages are lost, the correlation of a slightly older or newer repo
 more slowly than errors.
 
 Regression gives the covariance of a sender's new error e+ with all errors of the belief. Known are its own covariance
-P+, the broadcast covariances with other members, and that with the sender's previous error. The last is P+, too,
+P+, the broadcast covariances with other members, and the covariance with the sender's previous error. The last is P+,
 because the increment from the old error to the new one is not correlated with e+. With e+ = L x + w regressed on the
 known errors x, the covariance with any other error y is L cov(x, y). The joint covariance stays positive definite if
 that of w is. Otherwise P+ is inflated in the directions in which it is smaller than the correlations allow. All in
@@ -300,7 +300,7 @@ def by_clocks(model: Any, memory: Any, world: int, i: int, n: int):
 
 @device_function
 def stated_covariance(model: Any, memory: Any, world: int, i: int, n: int):
-    """Return the covariance, 6x6, that member n's report states, and that by clock offsets."""
+    """Return the covariance, 6x6, of member n's report, increased by clock offsets."""
     return mat66d(memory.member[world, i, n].report.P) + by_clocks(model, memory, world, i, n)
 
 
@@ -382,7 +382,7 @@ def solve_for(model: Any, memory: Any, world: int, i: int, n: int, count: int):
 def regress(model: Any, memory: Any, world: int, i: int, n: int, received: bool):
     """Set `scratch.row` to the covariance of member n's new error with all errors.
 
-    Its own is what its report states, inflated if needed. Known are the covariance with the previous error of n, if its
+    Its own covariance is the reported one, inflated if needed. Known are the covariance with n's previous error, if its
     report was `received` before, the broadcast ones, and approximate ones. Approximate ones that contradict the others
     are not used.
     """

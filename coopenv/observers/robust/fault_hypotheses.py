@@ -1,8 +1,8 @@
 """Hypotheses of faults of single sources.
 
 All sources have the same prior odds. The source of a hypothesis that is nearly certain is excluded: unless the gate has
-rejected its bearings, the covariance grows by what the solution without it differs by, and what it is less certain. An
-own sensor is used on: its fault becomes an error of its calibration, correlated with the error that it has caused.
+rejected its bearings, the covariance grows by the difference and the added uncertainty of the solution without it. An
+own sensor stays in use: its fault becomes an error of its calibration, correlated with the error that it has caused.
 Hypotheses that are only likely add to the covariance that is stated and sent, each by its probability. An excluded
 source stays under test, and is readmitted when its bearings fit without a fault and not with the one it had.
 """
@@ -47,9 +47,9 @@ from coopenv.world.warp_internals import device_function, subroutine
 
 @device_function
 def spread_of(memory: Any, world: int, i: int, q: int):
-    """Return what a fault of a source adds to the covariance of the source's error.
+    """Return the covariance (3, 3) that a fault of a source adds to the source's error.
 
-    Nothing, where the gate rejects its bearings: they do not pass into the estimate.
+    It is zero if the gate rejects the source's bearings, which then do not enter the estimate.
     """
     f = memory.source[world, i, q].offset
     spread = memory.source[world, i, q].covariance + wp.outer(f, f)
@@ -60,9 +60,9 @@ def spread_of(memory: Any, world: int, i: int, q: int):
 
 @subroutine
 def inflate_by_fault(memory: Any, world: int, i: int, q: int):
-    """Add to the covariance what the solution without a source differs by, and what it is less certain.
+    """Inflate the covariance by the difference and the added uncertainty of the solution without a source.
 
-    The pose stays: how much of a recent fault has passed into it is not known, and the next bearings will show it.
+    The pose stays: the share of a recent fault in it is unknown, and the next bearings will reveal it.
     """
     spread = spread_of(memory, world, i, q)
     for o in range(memory.belief[world, i].first_sender):
@@ -128,7 +128,7 @@ def forget_faults(memory: Any, world: int, i: int):
 
 @subroutine
 def exclude(memory: Any, world: int, i: int, q: int):
-    """Exclude a source; an own sensor is used on, with an uncertain scale, bias or mounting."""
+    """Exclude a source; an own sensor stays in use, with an uncertain scale, bias or mounting."""
     memory.source[world, i, q].exclusions += 1
     if is_own(q):
         if q == VELOCITY:
@@ -167,7 +167,7 @@ def drifts(memory: Any, world: int, i: int, q: int) -> bool:
 
 @device_function
 def upstream_fault_explains_drift(memory: Any, world: int, i: int, q: int, landmarks: int) -> bool:
-    """Return whether a sender depends on another one whose fault would explain its drift."""
+    """Return whether a sender depends on another sender with a fault that would explain its drift."""
     depends_on = memory.member[world, i, member_of(memory, world, i, q)].report.depends_on
     for c in range(1, 1 + SENDER_SLOTS):
         vehicle = memory.source[world, i, c].target - landmarks
@@ -210,7 +210,7 @@ def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: in
     """Weigh the hypotheses after a block of a time, s; exclude the source of one nearly certain, own sensors first.
 
     Soon after it began, a fault of the gyro looks like one of the camera: if both are likelier than none, both
-    count as faulty. Innovations of a wrong pose, while the gate is disabled, show no faults but those of own sensors.
+    count as faulty. While the gate is disabled, the innovations of a wrong pose reveal faults of own sensors only.
     """
     end_block(memory, world, i, time)
     memory.fault_mixture[world, i] = mat66d()
@@ -248,7 +248,7 @@ def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: in
 
 @wp.func
 def is_same(q: int, c: int) -> bool:
-    """Return whether two slots are the same source; all own sensors count as one, because all of them are used on."""
+    """Return whether two slots are the same source; all own sensors count as one, because all of them stay in use."""
     return q == c or (is_own(q) and is_own(c))
 
 
@@ -260,9 +260,9 @@ def weight_of(ratio: Any, most: Any):
 
 @device_function
 def test_excluded(frame: BearingFrame, memory: Any, world: int, i: int, n: int, q: int):
-    """Readmit an excluded source if its bearings fit well without an offset, and not with the one that it would have.
+    """Readmit an excluded source if its bearings fit well without an offset, and not with the expected offset.
 
-    That is the one at the exclusion, grown since if the source drifted.
+    The expected offset is the one at the exclusion, grown since if the source drifted.
     Errors of the own pose are the same in many frames, so that all frames together count as one.
     """
     H = -(memory.derivative[world, i, n, 0].jacobian[:, 3:] * wp.transpose(memory.member[world, i, 0].pose.R))

@@ -7,7 +7,7 @@ correction like the error itself, and an innovation r of covariance S by M = H P
 of M^T S^-1 r are the information on all faults.
 
 Senders have errors within their covariance without a fault. These are eliminated: with the members' covariance P and
-Pi = (P^-1 + A)^-1, what remains of source q is V = A_qq - A_q Pi A_q^T and v = a_q - A_q Pi a. The fault of q is then
+Pi = (P^-1 + A)^-1, the rest for source q is V = A_qq - A_q Pi A_q^T and v = a_q - A_q Pi a. The fault of q is then
 f = V^-1 v, and twice the logarithm of its likelihood ratio to none is v^T f. The solution without the source is
 x + Phi f with the covariance P + Phi V^-1 Phi^T; it needs no filter of its own.
 
@@ -106,7 +106,7 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
 def correct_drift_effect(frame: BearingFrame, memory: Any, world: int, i: int, q: int):
     """Correct the own and the calibration errors by a sender's drift, if that is a fault.
 
-    A bearing that fits and would not with the drift shows that the odometry is wrong instead, and counts as without it.
+    A bearing that fits, but would not fit with the drift, shows an odometry fault instead, and counts as without drift.
     """
     f = -(wp.transpose(memory.scratch[world, i, 0].pose.R) * memory.source[world, i, q].drift)
     for n in range(frame.bearings):
@@ -335,7 +335,7 @@ def own_variances(up: Any, P: Any):
 
 @wp.func
 def fault_variances(up: Any, Phi: Any, C: Any):
-    """Return likewise those of Phi f: Phi 6x3, and C 3x3 the covariance of the fault f."""
+    """Return the same sums for an error Phi f: Phi 6x3, and C 3x3 the covariance of the fault f."""
     vertical = vec3d()
     variances = vec2d()
     for i in range(3):

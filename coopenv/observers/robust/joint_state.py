@@ -133,7 +133,7 @@ def apply_corrections(memory: Any, world: int, i: int):
 
 @device_function
 def remove_member(memory: Any, world: int, i: int, n: int):
-    """Remove a member; those behind it move up."""
+    """Remove a member; later members move up."""
     members = memory.belief[world, i].members
     for m in range(n + 1, members):
         memory.member[world, i, m - 1] = memory.member[world, i, m]
@@ -147,7 +147,7 @@ def remove_member(memory: Any, world: int, i: int, n: int):
 
 @device_function
 def insert_member(memory: Any, world: int, i: int, n: int):
-    """Make room for a member whose error is independent of the others'; those from n on move down."""
+    """Make room at n for a member with an independent error; members from n on move down."""
     members = memory.belief[world, i].members
     for j in range(members - n):
         m = members - j
@@ -178,7 +178,7 @@ def mark_seen(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
 
 @device_function
 def make_room(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
-    """Return whether there is room for one more, after an eviction if there has to be one and may be one.
+    """Return whether there is room for another member, after an eviction if needed and possible.
 
     Evicted is the member that has been out of view for longest, unless that is within `MAX_UNSEEN_TIME`.
     """
@@ -237,7 +237,7 @@ TWELFTH = 1.0 / 12.0
 def odometry_variances(bias: Any, least: wp.float64, scale: Any):
     """Return the variances (4,) of the gyro's bias per axis and of the odometry's scale, by declared deviations.
 
-    That of the bias is `least` at least.
+    The bias has at least the variance `least`.
     """
     deviations = wp.max(vec3d(bias), vec3d(least))
     errors = vec4d(deviations[0], deviations[1], deviations[2], wp.float64(scale))
@@ -261,7 +261,7 @@ def begin_errors(model: Any, memory: Any, world: int, i: int):
 def walk_errors(model: Any, memory: Any, world: int, i: int, dt: Any):
     """Inflate the covariances of the calibration states by their walk over dt.
 
-    Those of the odometry walk as declared and as found, see `SourceMonitor`; the mounting, see `CALIBRATION_CHANGE`.
+    Odometry errors walk as declared and as estimated, see `SourceMonitor`; the mounting: see `CALIBRATION_CHANGE`.
     """
     noise = model.noise[i]
     walk = odometry_variances(noise.gyro_bias_walk, wp.float64(constants.GYRO_BIAS_WALK), noise.odometry_scale_walk)
@@ -287,8 +287,8 @@ def corrected(memory: Any, world: int, i: int, step: Pose, dt: Any):
 def errors_transition(memory: Any, world: int, i: int, step: Pose, dt: Any):
     """Return the derivative, 6x6, of the left error after a corrected increment by the odometry's errors.
 
-    The velocity is the mean of a second (m/s, body), not the measured one, whose noise is in the pose's error as well:
-    regressing one on the other would give a scale error of the ratio of noise to velocity, squared.
+    The velocity is the mean of a second (m/s, body). The noise of the measured one is also in the pose's error:
+    a regression on it would give a scale error of the ratio of noise to velocity, squared.
     Source: errors in variables, Fuller, Measurement Error Models, 1987, section 1.1.
     """
     scale = wp.float64(1.0) + memory.member[world, i, ERRORS].v[0]

@@ -62,7 +62,7 @@ def tangent_basis(b: Any):
 def set_bearing_measurement(memory: Any, world: int, i: int, n: int, member: int, b: Any, point: Any, variance: Any):
     """Set the n-th bearing b, to a point in the body frame of a member, or (member 0) in the map.
 
-    `variance` is that of the point per axis, m^2, without the member's own.
+    `variance` is the point's per axis, m^2, without the member's own.
     """
     memory.measurement[world, i, n].member = member
     memory.measurement[world, i, n].bearing = b
@@ -75,7 +75,7 @@ def set_bearing_measurement(memory: Any, world: int, i: int, n: int, member: int
 def is_received(model: Any, state: Any, memory: Any, world: int, i: int, box: int, tick: int) -> bool:
     """Return whether a fresh report in a box is received and valid; False for a landmark, whose box is below 0.
 
-    A vehicle whose pose is not known sends none, so that such a report is not from a correct one.
+    A vehicle without a known pose sends no report, so that a correct report contains one.
     """
     if box < 0:
         return False
@@ -86,7 +86,7 @@ def is_received(model: Any, state: Any, memory: Any, world: int, i: int, box: in
 
 @device_function
 def possible_speed(memory: Any, world: int, i: int):
-    """Return a speed, m/s, that a vehicle of unknown twist may have: the own one and that of a start from rest."""
+    """Return a possible speed, m/s, of a vehicle of unknown twist: the own speed and the speed of a start from rest."""
     return wp.length(memory.belief[world, i].mean_v) + wp.float64(constants.MAX_ACCELERATION * constants.MEAN_TIME)
 
 
@@ -94,7 +94,7 @@ def possible_speed(memory: Any, world: int, i: int):
 def received_variance(model: Any, memory: Any, world: int, i: int, box: int, frame: BearingFrame):
     """Return the variance per axis, m^2, of the reported position, as it counts in the search.
 
-    Hypotheses are tracked through many frames, in all of which that error is nearly the same.
+    Hypotheses are tracked through many frames, and its error is nearly the same in all of them.
     """
     variance = position_variance(memory.inbox[world, i, box].P) * wp.float64(THIRD)
     age = wp.float64(frame.tick - memory.inbox[world, i, box].tick) * model.camera_period

@@ -30,7 +30,7 @@ mat66f: Any = wp.types.matrix((6, 6), wp.float32)
 
 @wp.struct
 class Pose:
-    """Body to map; or an increment of odometry, from its end to its start."""
+    """Pose, body to map; or an increment of odometry, from its end to its start."""
 
     R: mat33d
     p: vec3d
@@ -54,7 +54,7 @@ class SenderReport:
     P: mat66f  # at the marker
     odometry: Pose  # of the marker, by dead reckoning from the start, in a frame of its own
     depends_on: wp.uint64  # bits of the vehicles whose messages are in it
-    carries_correlations: wp.int32  # those that do are fused
+    carries_correlations: wp.int32  # 1: the report has correlations and is fused
 
 
 @wp.struct
@@ -72,7 +72,7 @@ class Member:
     seen_tick: wp.int32  # when it was last in view
     report: SenderReport  # its last one, at which it stands
     source: wp.int32  # the slot of a sender's monitor, see integrity.py
-    correlation_unknown: wp.int32  # whether it is an earlier source of information whose correlation is not known
+    correlation_unknown: wp.int32  # 1: an earlier source of information with an unknown correlation
 
 
 @wp.struct
@@ -181,7 +181,7 @@ class BearingMeasurement:
     common_noise: wp.float64  # rad^2, the largest for any hypothesis
     distance: wp.float64  # m
     residual: vec2d  # rad
-    innovation: vec2d  # rad, what earlier bearings leave of it
+    innovation: vec2d  # rad, less the correction by earlier bearings
     weight: mat22d  # 1/rad^2, inverse of the innovation's covariance
 
 
@@ -228,7 +228,7 @@ class RobustMemory:
     """The memory of a world's observers.
 
     K members of a belief (the vehicle itself first), H hypotheses, J errors that a bearing depends on, C correlations
-    of a message, Q sources; other axes as in `coopenv.world.state`. What has lanes (L) is scratch.
+    of a message, Q sources; other axes as in `coopenv.world.state`. Arrays with lanes (L) are scratch.
     """
 
     belief: array("WN", JointBelief)
@@ -240,7 +240,7 @@ class RobustMemory:
     sensitivity: array("WNQO", mat63d)  # of the own error and the calibration errors by the fault of a source
     drift_effect: array("WNTO", vec6d)  # the errors themselves, if a sender's `drift` is a fault
     information: array("WNQU", mat33d)  # on a fault; and on it and that of a sender, by slot
-    fault_mixture: array("WN", mat66d)  # what faults that are not certain add to the covariance of the own pose
+    fault_mixture: array("WN", mat66d)  # addition of uncertain faults to the covariance of the own pose
     effect: array("WLXQ", mat23d)  # of an innovation by the fault of a source
     weighted_effect: array("WLXQ", mat23d)  # times the weight of the bearing
     block_scratch: array("WLKK", mat33d)  # blocks of the covariance of senders' errors or faults
@@ -248,7 +248,7 @@ class RobustMemory:
     hypothesis: array("WNH", Hypothesis)
     outbox: array("WNS", SenderReport)
     inbox: array("WNY", SenderReport)  # per receiver and box
-    inbox_sender: array("WNY", wp.int32)  # whose report that is, where not all are kept; -1: none
+    inbox_sender: array("WNY", wp.int32)  # sender of that report, where not all are kept; -1: none
     measurement: array("WLX", BearingMeasurement)
     derivative: array("WLXJ", Derivative)  # of a bearing, by the own error, that of its target, that of the mounting
     scratch: array("WLK", Scratch)
@@ -310,7 +310,7 @@ LARGE = numbers(LARGEST**3)
 
 
 def are_joint(blocks: Any, count: Any) -> Any:
-    """Return (...) which blocks (..., K, K, 6, 6) are covariances, as far as they count (...)."""
+    """Return flags (...): blocks (..., K, K, 6, 6) are covariances, as far as they count (...)."""
     K = blocks.shape[-3]
     used = np.repeat(np.arange(K) < count[..., None], 6, axis=-1)
     P = np.swapaxes(blocks, -3, -2).reshape(*count.shape, 6 * K, 6 * K)

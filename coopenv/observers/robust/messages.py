@@ -1,7 +1,7 @@
 """Reports that vehicles broadcast, their propagation, and their messages: 172 bytes, with correlations 256.
 
 A report holds a pose, its covariance, and the sender's dead reckoning. With the dead reckoning a receiver propagates
-the sender's last report to the new one as the sender itself did, P- = F P F^T + Q, whatever messages were lost. The
+the sender's last report to the new one as the sender itself did, P- = F P F^T + Q, also if messages were lost. The
 increment from there to the new report is fused, see correlated_fusion.py.
 Source: the information decorrelation of tracklets, Drummond, Tracklets and a hybrid fusion with process noise, SPIE
 3163, 1997; the channel filter of Grime and Durrant-Whyte, Data fusion in decentralized sensor networks, Control
@@ -175,7 +175,7 @@ def read(observer: Any, sender: int, message: Message, sent: int) -> None:
 
 
 def lead_along(made: Message, honest: Message) -> Message:
-    """Return a false message whose odometry leads where its pose does, as the honest message's leads to that one's."""
+    """Return a false message with odometry that leads to its pose, as the honest odometry leads to the honest pose."""
     if made.position is None or "odometry" not in honest.extra:
         return made
     R, p = from_six(np.asarray(honest.extra["odometry"], np.float64))
@@ -187,7 +187,7 @@ def lead_along(made: Message, honest: Message) -> Message:
 def _read_correlations(observer: Any, sender: int, message: Message, sent: int) -> None:
     """Store the correlations of a message; a CoopenvError or LookupError means that they are malformed.
 
-    They are with vehicles that are different from each other and from the sender.
+    Their vehicles must differ from each other and from the sender.
     """
     broadcast, ages, matrices = (
         np.asarray(message.extra[name]) for name in ("correlated_vehicles", "ages", "correlations")

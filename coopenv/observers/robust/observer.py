@@ -76,7 +76,7 @@ from coopenv.world.warp_internals import device_function, subroutine
 
 ANCHOR_ANGLE_VARIANCE = (0.25 * constants.KNOWN_ANGLE) ** 2
 ANCHOR_POSITION_VARIANCE = (0.25 * constants.KNOWN_POSITION) ** 2
-"""rad^2 and m^2, added to the covariance of an anchor, which may be wrong where the belief was lost."""
+"""Variances (rad^2 and m^2) added to the covariance of an anchor, which may be wrong at the time of the loss."""
 
 
 @subroutine
@@ -139,7 +139,7 @@ def declare_lost(model: Any, memory: Any, world: int, i: int, tick: int):
 def note_rejections(model: Any, memory: Any, world: int, i: int, share: Any, now: Any):
     """Let all bearings count from when most fail the gate until few do; begin a search if that does not help.
 
-    Most fail if the own pose is wrong. If those of one source alone fail, that source is as likely to be wrong.
+    Most bearings fail if the own pose is wrong. If only one source's bearings fail, that source is as likely wrong.
     """
     weight = wp.min(wp.float64(1.0), now.period / wp.float64(constants.MEAN_TIME))
     missed = memory.belief[world, i].rejected_share + (share - memory.belief[world, i].rejected_share) * weight
@@ -243,7 +243,7 @@ def resect(frame: BearingFrame, memory: Any, world: int, i: int) -> bool:
 
 @subroutine
 def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: PoseEstimate):
-    """Restart the belief with an own pose, which may depend on every vehicle that can be received."""
+    """Restart the joint state with an own pose, which may depend on every vehicle that can be received."""
     begin_belief(memory, world, i, estimate)
     begin_sources(memory, world, i)
     memory.belief[world, i].rejected_share = wp.float64(0.0)
@@ -265,7 +265,7 @@ def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: PoseEs
 
 @subroutine
 def write(state: Any, memory: Any, world: int, i: int):
-    """Write the own estimate to the state; during a search, that of the best hypothesis.
+    """Write the own estimate to the state; during a search, the best hypothesis's.
 
     The state holds positions in the body frame and covariances of (2 lambda, p), to first order.
     """

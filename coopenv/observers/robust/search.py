@@ -101,7 +101,7 @@ def add_hypothesis(memory: Any, world: int, i: int):
 
 @device_function
 def problem(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, number: int):
-    """Return whether there is the problem of a number, below `PROBLEMS`, and its bearings and points, rows.
+    """Return whether problem `number`, below `PROBLEMS`, exists, and its bearings and points, rows.
 
     The first is as measured. In the others a bearing is perturbed along an axis across it, or its point if that is not
     exactly known, to one side or the other.
@@ -172,7 +172,7 @@ def propagate_search(memory: Any, world: int, i: int, step: Pose, noise: Any):
 
 @device_function
 def sort_hypotheses(memory: Any, world: int, i: int):
-    """Sort hypotheses by their cost, the least one first; of equal ones, that nearest to the prior."""
+    """Sort hypotheses by ascending cost; equal costs by the distance to the prior."""
     count = memory.search[world, i].hypotheses
     for h in range(count):
         for g in range(h + 1, count):
@@ -185,7 +185,7 @@ def sort_hypotheses(memory: Any, world: int, i: int):
 
 @device_function
 def prune(memory: Any, world: int, i: int):
-    """Prune hypotheses with a large cost, those equal to a better one, and all of them if the best one misfits."""
+    """Prune hypotheses with a large cost, duplicates of better ones, and all of them if the best one misfits."""
     sort_hypotheses(memory, world, i)
     least = memory.hypothesis[world, i, 0].cost
     misfit = memory.hypothesis[world, i, 0].misfit
@@ -229,7 +229,7 @@ def expected_of(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
 
 @device_function
 def track_hypothesis(frame: BearingFrame, memory: Any, world: int, i: int, h: int, used: Any):
-    """Add the frame's bearings, but those used already, to the cost of a hypothesis; correct it by those that fit."""
+    """Add the frame's unused bearings to the cost of a hypothesis; correct it by the bearings that fit."""
     begin_belief(memory, world, i, memory.hypothesis[world, i, h].estimate)
     fitting = int(0)
     for n in range(frame.bearings):
@@ -264,7 +264,7 @@ def add_prior(memory: Any, world: int, i: int):
 
 @device_function
 def chosen_triple(frame: BearingFrame, memory: Any, world: int, i: int):
-    """Return three well placed bearings, others at every attempt."""
+    """Return three well placed bearings, different ones at every attempt."""
     triples = frame.bearings * (frame.bearings - 1) * (frame.bearings - 2) // 6
     triple = wp.vec3i(0, 0, 0)
     size = wp.float64(wp.inf)

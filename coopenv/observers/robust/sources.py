@@ -22,7 +22,7 @@ from coopenv.observers.robust.memory import (
 from coopenv.world.warp_internals import device_function, subroutine
 
 VELOCITY, CAMERA, GYRO = 0, SOURCES - 2, SOURCES - 1
-"""The slots of the own velocity, camera and angular velocity; behind the first are those of senders and landmarks."""
+"""Slots of the own velocity, camera and angular velocity; slots of senders and landmarks are behind the first."""
 NO_TARGET = -1
 
 
@@ -101,7 +101,7 @@ def member_of(memory: Any, world: int, i: int, q: int) -> int:
 
 @device_function
 def longest_unseen_slot(memory: Any, world: int, i: int, first: int, last: int) -> int:
-    """Return the free slot, or else that of the source unseen for longest, among some slots; -1 if members hold all."""
+    """Return a free slot among some slots, else the slot of the source unseen for longest; -1 if members hold all."""
     found = int(-1)
     for q in range(first, last):
         if memory.source[world, i, q].target == NO_TARGET:
@@ -157,7 +157,7 @@ def is_rejected(memory: Any, world: int, i: int, q: int) -> bool:
 
 @device_function
 def gate_locates_fault(memory: Any, world: int, i: int) -> bool:
-    """Return whether the gate rejects many bearings to a source whose fault is not clearly less likely than another."""
+    """Return whether the gate rejects many bearings to a source, with no fault clearly more likely than its own."""
     most = wp.float64(0.0)
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
