@@ -150,10 +150,10 @@ def test_a_folder_that_cannot_be_made(arguments: list[str], capsys: pytest.Captu
     ["run {}", "bench observers {}", "view {}", "film {} --out film.gif", "record {} --out a.mcap", "import {}"],
 )
 @pytest.mark.parametrize("name", ["nosuch.bag", "nosuch.db3"])
-def test_a_bag_that_does_not_exist_is_told_so(command: str, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bag_that_does_not_exist_is_an_error(command: str, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(command.format(name).split()) == 2
-    told = capsys.readouterr().err
-    assert f"no such bag: {name}" in told and "map" not in told and told.count("\n") == 1
+    error_text = capsys.readouterr().err
+    assert f"no such bag: {name}" in error_text and "map" not in error_text and error_text.count("\n") == 1
 
 
 @pytest.mark.parametrize("arguments", [["list"], ["schema"], ["--help"]])

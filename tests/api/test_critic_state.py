@@ -22,7 +22,7 @@ def drive(env: Any, steps: int) -> Any:
 
 
 @pytest.mark.parametrize("name", ["open_square", FOUR_WAY])
-def test_it_holds_what_infos_tell(name: str) -> None:
+def test_it_holds_the_values_of_infos(name: str) -> None:
     env = coopenv.parallel_env(name)
     observations, infos = drive(env, 12)
     scales, state = env.scenario.observation, env.state()

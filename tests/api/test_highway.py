@@ -60,12 +60,12 @@ def test_estimates_that_are_the_truth_are_observed_as_such(kind: Any, scenario: 
 def test_the_agent_is_observed_where_it_believes_itself_to_be() -> None:
     env, plain = wrapped(), IntersectionEnv()
     for sensed, true in zip(episode(env, 5), episode(plain, 5), strict=True):
-        told = sensed[-1]["localisation"]
-        assert_allclose(sensed[0][0, 1:3] * 100.0, told["position"], atol=5e-3)
-        assert_allclose(sensed[0][0, 5:7], [np.cos(told["heading"]), np.sin(told["heading"])], atol=1e-5)
+        reported = sensed[-1]["localisation"]
+        assert_allclose(sensed[0][0, 1:3] * 100.0, reported["position"], atol=5e-3)
+        assert_allclose(sensed[0][0, 5:7], [np.cos(reported["heading"]), np.sin(reported["heading"])], atol=1e-5)
         off = np.linalg.norm((sensed[0][0, 1:3] - true[0][0, 1:3]) * 100.0)
-        assert off == pytest.approx(told["position_error"], abs=0.1) and off > 1e-3  # errors have a height as well
-        assert np.linalg.eigvalsh(told["position_covariance"]).min() > 0.0
+        assert off == pytest.approx(reported["position_error"], abs=0.1) and off > 1e-3  # errors have a height as well
+        assert np.linalg.eigvalsh(reported["position_covariance"]).min() > 0.0
 
 
 def test_nothing_really_moves_where_it_is_believed_to_be() -> None:

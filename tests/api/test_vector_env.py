@@ -61,11 +61,11 @@ def test_single_world_is_world_0_bit_for_bit(name: str, dtype: str) -> None:
                 assert np.array_equal(observations[row], results[0][agent])
                 assert rewards[row] == np.float32(results[1][agent])
                 assert (terminated[row], truncated[row]) == (results[2][agent], results[3][agent])
-                told = results[4][agent]
+                info = results[4][agent]
                 for field in ("position_error", "nees", "log_determinant", "gramian_min_eigenvalue"):
-                    assert infos[field][row] == told[field]
-                assert {term: values[row] for term, values in infos["reward_terms"].items()} == told["reward_terms"]
-                assert infos["time"][row] == pytest.approx(told["time"])
+                    assert infos[field][row] == info[field]
+                assert {term: values[row] for term, values in infos["reward_terms"].items()} == info["reward_terms"]
+                assert infos["time"][row] == pytest.approx(info["time"])
                 assert infos["alive"][row]
 
 
@@ -309,9 +309,9 @@ def test_dict_observations_are_the_flat_ones_by_field() -> None:
         assert parts.observation_space.contains(named)
         assert np.array_equal(np.concatenate(list(named.values()), axis=1), rows)
         rows, *_, infos = flat.step(np.zeros((8, 2), np.float32))
-        named, *_, told = parts.step(np.zeros((8, 2), np.float32))
+        named, *_, named_infos = parts.step(np.zeros((8, 2), np.float32))
         if "final_obs" in infos:
-            assert np.array_equal(np.concatenate(list(told["final_obs"].values()), axis=1), infos["final_obs"])
+            assert np.array_equal(np.concatenate(list(named_infos["final_obs"].values()), axis=1), infos["final_obs"])
 
 
 def test_observer_by_name_and_unknown_words() -> None:

@@ -203,12 +203,12 @@ def test_true_episodes_only(autoreset: str) -> None:
     for _ in range(2 * DECISIONS + 2):
         _, _, terminated, truncated, infos = env.step(wide_turns(env.unwrapped))
         if "episode" in infos:
-            of, told = infos["_episode"], infos["episode"]
+            of, episode_info = infos["_episode"], infos["episode"]
             fresh = of & np.isnan(first_return)
-            first_return[fresh], first_length[fresh] = told["r"][fresh], told["l"][fresh]
-            weighted = sum(weights[name] * total for name, total in told["reward_terms"].items())
-            assert weighted[of] == pytest.approx(told["r"][of], abs=1e-3)
-            assert not told["r"][~of].any()
+            first_return[fresh], first_length[fresh] = episode_info["r"][fresh], episode_info["l"][fresh]
+            weighted = sum(weights[name] * total for name, total in episode_info["reward_terms"].items())
+            assert weighted[of] == pytest.approx(episode_info["r"][of], abs=1e-3)
+            assert not episode_info["r"][~of].any()
         over = env.unwrapped.world_major(terminated | truncated).all(axis=1)
         if autoreset == "disabled" and over.any():
             env.reset(options={"reset_mask": over})

@@ -136,7 +136,7 @@ def masks_and_ages(env: Env, agent: str, seen: dict[str, np.ndarray], info: dict
     assert set(np.unique(seen["bearing_mask"])) <= {0.0, 1.0} and set(np.unique(seen["message_mask"])) <= {0.0, 1.0}
     for name in ("bearing_age", "odometry_age", "message_age"):
         assert ((seen[name] >= 0.0) & (seen[name] <= 1.0)).all(), name
-    # Whatever is older than a part of a second has been told to be missing: by a computer that was busy, say.
+    # Frames older than a part of a second are reported missing, as by a busy computer.
     assert (seen["odometry_age"] < 0.5).all() or info["missing_ticks"] > 0, agent
     if any(visible):
         assert neighbours
@@ -192,12 +192,12 @@ def test_actions_mean_the_same_speeds_and_angles(folder: Path, processes: Path) 
     actions = np.random.default_rng(3).uniform(-1.0, 1.0, (40, 2)).astype(np.float32)  # none repeats
     expected = simulated()
     expected.reset(seed=1)
-    told = []
+    simulated_commands = []
     for action in actions:
         expected.step(dict.fromkeys(expected.possible_agents, action))
-        told.append(expected.engine.view("command")[0, :, :2].copy())
-    assert len({tuple(np.round(command[0], 6)) for command in told}) > 4
-    wanted = dict(zip(("svea7", "svea1"), np.swapaxes(told, 0, 1), strict=True))
+        simulated_commands.append(expected.engine.view("command")[0, :, :2].copy())
+    assert len({tuple(np.round(command[0], 6)) for command in simulated_commands}) > 4
+    wanted = dict(zip(("svea7", "svea1"), np.swapaxes(simulated_commands, 0, 1), strict=True))
 
     def check(network: Any, env: Env) -> None:
         arrivals: list[Arrival] = []

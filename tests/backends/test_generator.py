@@ -95,7 +95,7 @@ def test_it_is_driven_by_commands_in_si_units() -> None:
         assert_allclose(command.acceleration, [2.0] * 3)
 
 
-def test_who_has_arrived_is_told_to_stand() -> None:
+def test_an_arrived_vehicle_is_commanded_to_stand() -> None:
     fleet = Fleet()
     env = make(fleet)
     env.reset(seed=0)
@@ -106,7 +106,7 @@ def test_who_has_arrived_is_told_to_stand() -> None:
     assert fleet.commands[-1].speed[0] == 0.0 and fleet.commands[-1].speed[1] > 0.5
 
 
-def test_late_missing_and_empty_ticks_are_told() -> None:
+def test_late_missing_and_empty_ticks_are_reported() -> None:
     fleet = Fleet()
     env = make(fleet)
     _, infos = env.reset(seed=0)
@@ -300,29 +300,29 @@ class Talkative(Fleet):
 
     def __init__(self, observer: str) -> None:
         super().__init__(observer)
-        self.told: list[VehicleBroadcast] = []
+        self.broadcasts: list[VehicleBroadcast] = []
 
     def broadcast(self, sent: Sequence[VehicleBroadcast]) -> None:
-        self.told.extend(sent)
+        self.broadcasts.extend(sent)
 
     def notes(self, vehicle: int) -> dict[str, Any]:
         return {}
 
 
 @pytest.mark.parametrize("observer", ["riccati", "robust"])
-def test_it_is_told_what_embedded_observers_say(observer: str) -> None:
+def test_it_receives_the_broadcasts_of_embedded_observers(observer: str) -> None:
     fleet = Talkative(observer)
     engine = Engine(fleet.scenario, 1, "float64", backend=fleet)
     engine.reset([0])
     engine.step(ticks=9)
-    assert [told.vehicle for told in fleet.told] == [0, 1, 2] * 10
-    for told in fleet.told[-3:]:
-        estimate = engine.view("estimate_position")[0, told.vehicle]
-        assert_allclose(told.rotation.T @ told.position, estimate)
-        assert told.message is not None
+    assert [sent.vehicle for sent in fleet.broadcasts] == [0, 1, 2] * 10
+    for sent in fleet.broadcasts[-3:]:
+        estimate = engine.view("estimate_position")[0, sent.vehicle]
+        assert_allclose(sent.rotation.T @ sent.position, estimate)
+        assert sent.message is not None
         if observer == "riccati":  # the other one's reports are of a tick before
-            marker = told.rotation @ fleet.scenario.vehicles[told.vehicle].marker
-            assert_allclose(told.message.position, told.position + marker, atol=1e-5)
+            marker = sent.rotation @ fleet.scenario.vehicles[sent.vehicle].marker
+            assert_allclose(sent.message.position, sent.position + marker, atol=1e-5)
 
 
 @pytest.mark.parametrize(

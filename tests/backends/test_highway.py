@@ -85,7 +85,7 @@ def test_commands_are_speeds_and_steering_to_the_left() -> None:
     assert env.engine.view("steering")[0, 3] == pytest.approx(0.5)
 
 
-def test_traffic_drives_itself_whatever_it_is_told() -> None:
+def test_traffic_ignores_commands() -> None:
     moved = []
     for action in (-1.0, 1.0):
         env = coopenv.parallel_env(ROUNDABOUT, dtype="float64")

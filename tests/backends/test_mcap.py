@@ -1,4 +1,4 @@
-"""A recording comes back from its file bit for bit, viewers can read the file, and broken files are told apart."""
+"""A recording comes back from its file bit for bit, viewers can read the file, and broken files are distinguished."""
 
 from __future__ import annotations
 

@@ -252,7 +252,7 @@ def test_a_command_is_not_held_for_ever(dataset):
     assert v.tolist() == [0.0, 0.2, 0.0, 0.1, 0.0]
 
 
-def test_what_is_of_no_use_is_told(tmp_path):
+def test_what_is_of_no_use_is_reported(tmp_path):
     folder = write(tmp_path, seconds=6.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -271,7 +271,7 @@ def test_what_is_of_no_use_is_told(tmp_path):
     assert [str(w.message) for w in caught] == [f"mrclam_6: no detections of robot 5; {said}"]
 
 
-def test_detections_beyond_the_odometry_are_left_out_and_told(tmp_path):
+def test_detections_beyond_the_odometry_are_left_out_and_reported(tmp_path):
     folder = write(tmp_path, seconds=6.0)
     path = folder / "Robot2_Measurement.dat"
     table, others = np.loadtxt(path), [len(robot.detections) for robot in load_dataset("mrclam_6", folder).robots]

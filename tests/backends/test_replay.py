@@ -313,7 +313,7 @@ def tick_by_tick(backend: Any) -> Backend:
 
 
 @pytest.mark.parametrize("case", TICK_CASES)
-def test_a_simulated_world_told_tick_by_tick_is_the_one_on_the_device(case: str) -> None:
+def test_a_simulated_world_given_tick_by_tick_is_the_one_on_the_device(case: str) -> None:
     name, overrides = TICK_CASES[case]
     scenario = coopenv.load_scenario(name, {"horizon": 1.0, **overrides})
     engines = [Engine(scenario, 1, "float64")]
@@ -335,7 +335,7 @@ def test_a_simulated_world_told_tick_by_tick_is_the_one_on_the_device(case: str)
 
 
 @pytest.mark.parametrize("observer", ["riccati", "mekf"])
-def test_a_recording_told_tick_by_tick_is_the_one_on_the_device(observer: str) -> None:
+def test_a_recording_given_tick_by_tick_is_the_one_on_the_device(observer: str) -> None:
     recording = simulated("busy_intersection", 3, v2x__loss=0.3)
     options = {"observer.name": observer}
     backends = [Replay(recording, "drive", options), tick_by_tick(Replay(recording, "drive", options))]

@@ -46,12 +46,12 @@ def test_one_job_is_this_process_unless_limits_are_given() -> None:
     assert find_executor("local", 1, seconds=5.0) == Local(1, ProcessLimits(seconds=5.0))
 
 
-def test_what_cannot_be_sent_to_a_process_is_told() -> None:
+def test_what_cannot_be_sent_to_a_process_is_reported() -> None:
     with pytest.raises(CoopenvError, match="or use --jobs 1"):
         Local(2).map(lambda x: x, [lambda: None] * 2, lambda _: None)
 
 
-def test_a_process_that_dies_is_told() -> None:
+def test_a_process_that_dies_is_reported() -> None:
     with pytest.raises(CoopenvError, match="a process died"):
         Local(2).map(os._exit, [1, 1], lambda _: None)
 

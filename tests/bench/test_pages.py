@@ -65,7 +65,7 @@ def test_the_page_of_every_environment_is_up_to_date(name: str) -> None:
             assert pictures.n_frames > 20, again
 
 
-def test_actions_are_told_of_a_vehicle_that_is_driven() -> None:
+def test_actions_are_described_for_a_vehicle_that_is_driven() -> None:
     page = environment_page("behind_truck", load_scenario("behind_truck"), PAGES)  # vehicle_1 is the truck
     assert "for `vehicle_2`, the first driven vehicle" in page and "| speed | 0 | 0.9 | m/s |" in page
 

@@ -151,10 +151,10 @@ def test_a_part_drives_as_the_whole(data):
     assert cut.visible[: n - 1].sum() == pytest.approx(whole.visible[k : k + n - 1].sum(), abs=10)
 
 
-def test_odometry_is_told_otherwise(data):
+def test_odometry_is_changed(data):
     robot = data.robots[0]
-    told = changed(data, 0, odometry(turns=1.5, speed=1.1)).robots[0].odometry
-    np.testing.assert_allclose(told, robot.odometry * (1.0, 1.1, 1.5))
+    changed_odometry = changed(data, 0, odometry(turns=1.5, speed=1.1)).robots[0].odometry
+    np.testing.assert_allclose(changed_odometry, robot.odometry * (1.0, 1.1, 1.5))
     assert len(changed(data, 0, odometry(rate=4.0)).robots[0].odometry) == pytest.approx(120, abs=3)
     assert (changed(data, 0, drifting(0.01)).robots[0].odometry[:, 2] > robot.odometry[:, 2]).all()
 

@@ -175,14 +175,14 @@ def test_the_whole_run_on_a_cpu(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_rounds_alternate() -> None:
-    told: list[str] = []
+    names: list[str] = []
 
     def step(name: str) -> float:
-        told.append(name)
-        return float(len(told))
+        names.append(name)
+        return float(len(names))
 
     times = alternate([partial(step, "a"), partial(step, "b")], 3)
-    assert told == ["a", "b"] * 3 and times.tolist() == [[1, 2], [3, 4], [5, 6]]
+    assert names == ["a", "b"] * 3 and times.tolist() == [[1, 2], [3, 4], [5, 6]]
 
 
 def test_each_stage_is_switched_off_on_top_of_those_before() -> None:

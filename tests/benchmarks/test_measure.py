@@ -38,11 +38,11 @@ def workers() -> Iterator[Workers]:
 
 
 def test_rates_are_of_the_work_done(workers: Workers) -> None:
-    told: list[str] = []
+    progress: list[str] = []
     cases = [fake_case(), fake_case("other", worlds=1)]
-    results = measure(cases, workers, seconds=0.05, repeats=3, on_progress=told.append)
-    assert len(told) == units_of_work(cases, 3)
-    assert told[0] == "building fake x 3"
+    results = measure(cases, workers, seconds=0.05, repeats=3, on_progress=progress.append)
+    assert len(progress) == units_of_work(cases, 3)
+    assert progress[0] == "building fake x 3"
     for result, worlds in zip(results, (3, 1), strict=True):
         assert len(result.rounds) == 3
         assert result.env_steps_per_s == pytest.approx(worlds / STEP)

@@ -52,7 +52,7 @@ def checked(watched: Watched) -> None:
 
 
 def colours(page: Any) -> int:
-    """Return how many colours, coarsely told apart, the page shows."""
+    """Return the number of coarsely distinguished colours of the page."""
     with Image.open(BytesIO(page.screenshot(timeout=LOADING))) as picture:
         small = np.asarray(picture.convert("RGB").resize((200, 120))) >> 5
     return len(np.unique(small.reshape(-1, 3), axis=0))

@@ -156,8 +156,8 @@ def test_a_folder_does_not_take_the_place_of_an_environment() -> None:
     Path("crossing_path/metadata.yaml").touch()  # as a bag has it
     assert main(["run", "crossing_path", "--steps", "2", "--no-figures", "--out", "again"]) == 0
     assert main(["film", "./overtaking", "--fps", "1", "--out", "film.gif"]) == 0
-    told = refused("film", "./overtaking", "--set", "horizon=1.0", "--out", "film.gif")
-    assert "./overtaking has been run" in told
+    error_text = refused("film", "./overtaking", "--set", "horizon=1.0", "--out", "film.gif")
+    assert "./overtaking has been run" in error_text
     refused("run", "./crossing_path", "--no-figures", "--out", "again")
 
 

@@ -247,7 +247,7 @@ def test_summary_of_the_synthetic_run() -> None:
     assert rows[3]["mean_targets_in_view"] == pytest.approx(3 - np.mean(np.sin(3 * np.arange(3001) / 60) > 0.97))
 
 
-def test_mirror_is_told_by_the_end_of_the_run() -> None:
+def test_mirror_is_detected_by_the_end_of_the_run() -> None:
     errors = np.array([[179.0, 10.0, 0.0], [2.0, 178.0, 149.0]])
     assert metrics.mirrored(errors).tolist() == [False, True, False]
 

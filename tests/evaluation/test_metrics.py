@@ -114,7 +114,7 @@ def test_vehicles_that_go_on_have_arrived_once_they_have(episodes: Episodes) -> 
     np.testing.assert_array_equal(replace(episodes, arrivals=on).travel_time[there], episodes.travel_time[there])
 
 
-def test_looking_is_told_from_the_nearest_piece_of_the_route() -> None:
+def test_looking_counts_from_the_nearest_piece_of_the_route() -> None:
     route = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [4.0, 4.0]])[None, None]
     position = np.array([[0.0, 0.0], [1.0, 0.3], [4.2, 2.0], [3.9, 6.0]])[:, None, None]
     heading = np.array([0.3, np.pi / 2 - 0.4, -np.pi])[:, None, None]

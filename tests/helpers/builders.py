@@ -41,7 +41,7 @@ def circling(neighbours: Sequence[list[str]] | None = None, **more: Any) -> list
 
 
 def raw(vehicles: Sequence[dict[str, Any]] | None = None, **sections: Any) -> dict[str, Any]:
-    """Return the data of a scenario: one standing vehicle among four landmarks, unless told otherwise."""
+    """Return the data of a scenario: by default one standing vehicle among four landmarks."""
     return {
         "title": "test",
         "horizon": 10000.0,

@@ -95,7 +95,7 @@ MISREAD = 0.004  # share of barcodes
 
 
 def barrier_robots(seed: int, seconds: float = 150.0, turn_scale: float = 0.6, barriers: int = 3) -> Dataset:
-    """Return a sub-dataset in which robots turn `turn_scale` times what they were told."""
+    """Return a sub-dataset in which robots turn `turn_scale` times their commands."""
     rng = np.random.default_rng([9, seed])
     centre, angle = rng.uniform(LOW + 1, HIGH - 1, (barriers, 2)), rng.uniform(0, np.pi, barriers)
     half = rng.uniform(0.8, 1.6, barriers)[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -109,7 +109,7 @@ def barrier_robots(seed: int, seconds: float = 150.0, turn_scale: float = 0.6, b
 def _drive(rng: np.random.Generator, seconds: float, turn_scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Return poses (K, 3) every DT and the log (n, 3) of commands at 8 Hz."""
     steps = int(seconds / DT)
-    pose, told = np.zeros((steps, 3)), np.zeros((steps, 2))
+    pose, commanded = np.zeros((steps, 3)), np.zeros((steps, 2))
     x = np.array([*rng.uniform(LOW + 1, HIGH - 1), rng.uniform(-3, 3)])
     scale, done, until, command, waiting = turn_scale * rng.normal(1, 0.05), np.zeros(2), 0.0, np.zeros(2), []
     wanted = np.zeros(2)
@@ -122,14 +122,14 @@ def _drive(rng: np.random.Generator, seconds: float, turn_scale: float) -> tuple
         while waiting and t >= waiting[0][0]:
             wanted = waiting.pop(0)[1]
         done = done + (wanted - done) * (DT / 0.12)
-        pose[k], told[k] = x, command
+        pose[k], commanded[k] = x, command
         x = x + DT * np.array([done[0] * math.cos(x[2]), done[0] * math.sin(x[2]), done[1]])
     logged = np.unique(np.clip(((np.arange(0, seconds, 1 / 8) + rng.uniform(-0.02, 0.02)) / DT).astype(int), 0, None))
-    return pose, np.column_stack([logged * DT, told[logged]])
+    return pose, np.column_stack([logged * DT, commanded[logged]])
 
 
 def _command(rng: np.random.Generator, x: np.ndarray, t: float, scale: float) -> tuple[np.ndarray, float]:
-    """Return what a robot is told next, m/s and rad/s, and until when."""
+    """Return a robot's next command, m/s and rad/s, and its end, s."""
     inside = (LOW + HIGH) / 2 - x[:2]
     off = (math.atan2(inside[1], inside[0]) - x[2] + math.pi) % (2 * math.pi) - math.pi
     outside = bool((x[:2] < LOW + 0.7).any() or (x[:2] > HIGH - 0.7).any())

@@ -163,8 +163,8 @@ KEYS = {
 TICKS = 3
 
 
-def told_of(made: Recording, *names: str) -> Recording:
-    """Return a record whose vehicles have been told of errors."""
+def with_declared_errors(made: Recording, *names: str) -> Recording:
+    """Return a record of vehicles with declared errors."""
     noises = dict(KEYS[name] for name in names)
     setups = tuple(replace(setup, noise=replace(setup.noise, **noises)) for setup in made.setups)
     return replace(made, setups=setups)
@@ -238,14 +238,14 @@ def by_differences(made: Recording, names: tuple[str, ...]) -> np.ndarray:
     ],
 )
 def test_errors_that_last_count_as_unknown(names: tuple[str, ...]) -> None:
-    made = told_of(small_record(TICKS), *names)
+    made = with_declared_errors(small_record(TICKS), *names)
     assert_same_covariance(cramer_rao(made).covariance[-1], by_differences(made, names), atol=3e-3)
 
 
-def test_who_is_told_of_nothing_has_the_bound_of_poses() -> None:
+def test_without_declared_errors_the_bound_is_of_poses() -> None:
     made = small_record(TICKS)
     assert len(error_states(made)[0]) == 6
-    plain, more = cramer_rao(made), cramer_rao(told_of(made, "scale", "bias", "mounting", "clock"))
+    plain, more = cramer_rao(made), cramer_rao(with_declared_errors(made, "scale", "bias", "mounting", "clock"))
     assert (more.position[1:] > plain.position[1:]).all()
 
 

@@ -47,7 +47,7 @@ def played(
     Args:
         factory: of the observers.
         recording: whose ticks.
-        shift: (tick) -> s by which its time is told late.
+        shift: (tick) -> s by which its time is late.
         ticks: how many of them.
     """
     draw, L = np.random.default_rng(0), recording.setups[0].landmarks
@@ -63,7 +63,7 @@ def played(
         for vehicle in recording.order:
             tick = merged(recording, first, last, vehicle)
             heard = {t: sent[t] for t in tick.targets.tolist() if t in sent and draw.random() < 0.7}
-            messages = {t: Received(message, time - told) for t, (message, told) in heard.items()}
+            messages = {t: Received(message, time - sent_at) for t, (message, sent_at) in heard.items()}
             estimates.append(observers[vehicle].update(replace(tick, time=time, dt=time - before, messages=messages)))
             sent[L + vehicle] = observers[vehicle].message(), time
     return estimates, observers

@@ -191,7 +191,7 @@ class UnspeakableError(Exception):
         (lambda e: replace(e, nis="small", nis_dof=2), "TypeError"),
     ],
 )
-def test_what_is_no_estimate_is_told_in_one_line(change: Any, said: str) -> None:
+def test_what_is_no_estimate_is_one_error_line(change: Any, said: str) -> None:
     class Odd(Probe):
         def update(self, tick: Tick) -> Estimate:
             return change(super().update(tick))
@@ -223,7 +223,7 @@ def test_a_sent_message_does_not_change_any_more() -> None:
         (Message(np.full(3, np.nan)), "message: position is not a finite array of shape (3,) with numbers up to 1e+09"),
     ],
 )
-def test_what_is_no_message_is_told_in_one_line(odd: Any, said: str) -> None:
+def test_what_is_no_message_is_one_error_line(odd: Any, said: str) -> None:
     class Odd(Probe):
         def message(self) -> Any:
             return odd if self.index == 6 else super().message()

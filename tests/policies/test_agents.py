@@ -186,7 +186,7 @@ def test_agents_in_code_that_are_none(text: str, message: str, tmp_path: Path, m
         load_policy(text, coopenv.load_scenario(FOUR_WAY), 0)
 
 
-def test_what_is_nearly_an_agent_is_told_how_to_become_one(tmp_path: Path) -> None:
+def test_the_error_of_an_incomplete_agent_names_the_remedy(tmp_path: Path) -> None:
     (tmp_path / "begun").mkdir()
     (tmp_path / "begun" / "checkpoint.safetensors").write_bytes(b"")
     (tmp_path / "mine.py").write_text("class Mine: ...")
@@ -242,7 +242,7 @@ def test_observations_of_another_kind(observations: Any) -> None:
         act(played_back(np.zeros((1, 2, 2))), observations)
 
 
-def test_a_policy_that_remembers_is_told_when_an_episode_begins() -> None:
+def test_a_policy_with_memory_is_restarted_at_an_episode() -> None:
     class Counting:
         asked = 0
 

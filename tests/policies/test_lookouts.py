@@ -340,7 +340,7 @@ def test_what_is_needed_is_named() -> None:
 
 
 def test_distances_fit_the_car() -> None:
-    """Those of small cars are what they are told; a full-size one keeps room for a car across its way."""
+    """Small cars have the given sizes; a full-size car keeps room for a car across its way."""
     small, large = RouteFollower(SCENARIO), RouteFollower(load_scenario("highway_intersection"))
     assert (small.clearance, small.closest, small.look_ahead, small.foresight) == (0.9, 0.75, 1.0, 6.0)
     assert small.paces == (1.0,)

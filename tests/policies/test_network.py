@@ -210,7 +210,7 @@ NO_SETTINGS = "observation = {}\naction = {}"
         (NO_SETTINGS, "", "ENV --settings old/train.toml --out old --force"),
     ],
 )
-def test_one_of_an_earlier_version_is_told_how_to_train_it_anew(
+def test_the_error_of_an_earlier_version_names_the_command_of_training(
     network: str, training: str, command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -219,5 +219,5 @@ def test_one_of_an_earlier_version_is_told_how_to_train_it_anew(
     (tmp_path / "old" / "agent.toml").write_text(OLD.format(environment="facade", network=network, training=training))
     with pytest.raises(coopenv.CoopenvError) as error:
         find_agent("old")
-    told = "old/agent.toml: saved by an earlier version of coopenv; train it anew: coopenv train"
-    assert str(error.value) == f"{told} {command}"
+    expected = "old/agent.toml: saved by an earlier version of coopenv; train it anew: coopenv train"
+    assert str(error.value) == f"{expected} {command}"

@@ -91,7 +91,7 @@ def test_a_notebook_that_asks_for_colours_gets_lines(text: io.StringIO) -> None:
     assert "\r" not in text.getvalue() and "\x1b[2K" not in text.getvalue()
 
 
-def test_time_left_is_not_told_before_there_is_enough_to_go_by(
+def test_time_left_is_not_reported_before_there_is_enough_to_go_by(
     text: io.StringIO, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = [100.0]
@@ -168,7 +168,7 @@ def looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
     return looked
 
 
-def test_compiling_is_told_once(looks: list[set[str]], tmp_path: Path) -> None:
+def test_compiling_is_reported_once(looks: list[set[str]], tmp_path: Path) -> None:
     text = io.StringIO()
     with compile_notice(Console(file=text)):
         (tmp_path / "wp_new_0123456_p1_t2").mkdir()

@@ -98,8 +98,8 @@ def test_an_interrupt_leaves_no_process_and_what_has_been_driven(moment: str, tm
     wait_until(lambda: not mentioning(f"127.0.0.1:{port}"))
     drive = "out/svea_overtaking.mcap"
     driven = moment == "driving"
-    told = f"written: {drive}; the drive up to here: coopenv run {drive}" if driven else "nothing written"
-    assert errors.splitlines()[-1] == f"interrupted; {told}"
+    outcome = f"written: {drive}; the drive up to here: coopenv run {drive}" if driven else "nothing written"
+    assert errors.splitlines()[-1] == f"interrupted; {outcome}"
     kept = [str(path.relative_to(tmp_path)) for path in (tmp_path / "out").rglob("*") if path.is_file()]
     assert kept == ([drive] if driven else [])
     for path in kept:
@@ -151,14 +151,14 @@ def test_cars_that_are_stopped_end_the_demo_with_a_status_of_its_own(
 
 
 @pytest.mark.slow
-def test_without_true_poses_the_drive_is_kept_and_the_topics_are_told(
+def test_without_true_poses_the_drive_is_kept_and_the_topics_are_reported(
     fleet_of_my_own: Callable[[str], list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Trajectory, "with_truth", lambda trajectory, vehicles: [])
     result = CliRunner().invoke(app, fleet_of_my_own(""))
     assert isinstance(result.exception, CoopenvError)
-    told = str(result.exception)
-    assert told.startswith("mine: without true poses") and "svea7" in told and "too late for the ticks" in told
+    message = str(result.exception)
+    assert message.startswith("mine: without true poses") and "svea7" in message and "too late for the ticks" in message
     assert "No true poses, and so no errors" in result.output
     (line,) = (line for line in result.output.splitlines() if "s driven" in line)
     missed, _, decisions = line.split(" s driven, ")[1].split()[:3]
@@ -200,19 +200,19 @@ def interrupted(fleet: tuple[Path, str], folder: Path, number: signal.Signals) -
 
 def replayed(folder: Path) -> tuple[str, str]:
     process = start((*COOPENV, "run", "drive.mcap", "--no-figures", "--out", "again"), folder)
-    told, errors = process.communicate(timeout=2 * DEADLOCK)
+    printed, errors = process.communicate(timeout=2 * DEADLOCK)
     assert process.returncode == 0, errors
-    return told, errors
+    return printed, errors
 
 
 @pytest.mark.slow
-def test_what_an_interrupt_keeps_is_told_and_can_be_shown(fleet: tuple[Path, str], tmp_path: Path) -> None:
+def test_what_an_interrupt_keeps_is_reported_and_can_be_shown(fleet: tuple[Path, str], tmp_path: Path) -> None:
     errors, status = interrupted(fleet, tmp_path, signal.SIGINT)
     assert status == 130
     assert errors.splitlines()[-1] == "interrupted; kept: drive.mcap, the drive up to here: coopenv run drive.mcap"
     assert [path.name for path in tmp_path.iterdir()] == ["drive.mcap"]
-    told, errors = replayed(tmp_path)
-    assert "Stopped: Interrupted\n" in told and "warning" not in errors
+    printed, errors = replayed(tmp_path)
+    assert "Stopped: Interrupted\n" in printed and "warning" not in errors
     assert json.loads((tmp_path / "again" / "metrics.json").read_text())["policy"] == "recorded"
 
 
@@ -220,13 +220,13 @@ def test_what_an_interrupt_keeps_is_told_and_can_be_shown(fleet: tuple[Path, str
 def test_a_station_that_is_killed_leaves_its_drive(fleet: tuple[Path, str], tmp_path: Path) -> None:
     _, status = interrupted(fleet, tmp_path, signal.SIGKILL)
     assert status == -9
-    told, errors = replayed(tmp_path)
+    printed, errors = replayed(tmp_path)
     (warning,) = (line for line in errors.splitlines() if line.startswith("warning"))
     assert (
         "drive.mcap: cut off, the end of the MCAP file is missing: nothing after " in warning
         and "is replayed" in warning
     )
-    assert "ended before its time" in told and "RMSE" in told
+    assert "ended before its time" in printed and "RMSE" in printed
 
 
 PATIENT = "odometry_age = 2.0\nmissed_deadlines = 60\n"
@@ -279,8 +279,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
         backend = cars(path, hub, car="svea7", overrides=NEAR)
         try:
             made = Rollout(backend.scenario, 0, policy="route_follower", backend=backend, options={"arm": True})
-            told = lambda: links_line(backend)  # noqa: E731
-            result = execute("lab", made, folder / "out", Console(file=log), NEAR, 1.0, "png", False, told)
+            links = lambda: links_line(backend)  # noqa: E731
+            result = execute("lab", made, folder / "out", Console(file=log), NEAR, 1.0, "png", False, links)
             report(made, result, folder / "out", Console(file=out, width=100))
             links_report(backend, Console(file=out, width=100))
         finally:
@@ -354,7 +354,7 @@ def test_what_gates_refused_before_does_not_count() -> None:
     assert gates.refused("svea7") == {"stale": 2, "session": 3}  # it was started anew
 
 
-def test_what_no_camera_can_tell_is_told(tmp_path: Path) -> None:
+def test_what_no_camera_can_measure_is_reported(tmp_path: Path) -> None:
     path = write_fleet(tmp_path, OVERTAKING.replace("SL2 = 2, ", "").replace("marker = 6", ""))
     with pytest.warns(DataWarning, match=r"fleet\.toml: no markers, .*: SL2, vehicle_2$"):
         cars(path, Hub()).close()

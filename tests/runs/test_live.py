@@ -239,7 +239,7 @@ def test_mp4_has_every_picture(record: SceneRecord, tmp_path: Path) -> None:
     assert ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] == 6
 
 
-def test_other_formats_and_missing_extras_are_told(
+def test_other_formats_and_missing_extras_are_reported(
     record: SceneRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(OutputError, match=r"film\.avi: unknown format of a film; known: \.mp4, \.gif, \.webp"):
@@ -268,7 +268,7 @@ def pictures(count: int) -> Iterator[np.ndarray]:
     return iter(np.random.default_rng(1).integers(0, 256, (count, 241, 321, 3), dtype=np.uint8))
 
 
-def test_a_film_that_does_not_fit_on_the_disk_is_told(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_film_that_does_not_fit_on_the_disk_is_reported(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
     with (
         small_disk(tmp_path / "disk", "200k") as disk,

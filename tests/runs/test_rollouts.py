@@ -224,7 +224,7 @@ def test_the_table_has_a_row_per_vehicle_and_a_legend() -> None:
     ]
 
 
-def test_what_a_recording_lacks_is_told() -> None:
+def test_what_a_recording_lacks_is_reported() -> None:
     metrics = {"ticks": 99, "missing_ticks": {"vehicle_1": 1, "vehicle_2": 20}}
     assert [*gaps(metrics, 60, 2.5)] == [
         "Judged at 60 of 100 ticks, up to 2.5 s: at the others a true pose is not known.",
@@ -233,7 +233,7 @@ def test_what_a_recording_lacks_is_told() -> None:
     assert [*gaps(metrics | {"missing_ticks": {}}, 100, 9.9)] == []
 
 
-def test_what_odometry_carries_is_told_apart() -> None:
+def test_what_odometry_carries_is_distinguished() -> None:
     """Bearings end at 20 s, when every estimate is within centimetres: odometry keeps it there."""
     run = make_trajectory()
     dark = replace(run, visible=run.visible & (run.t < 20.0)[:, None, None])

@@ -392,7 +392,7 @@ def test_of_queued_wishes_for_one_thing_the_last_one_counts(monkeypatch: pytest.
     reel.close()
 
 
-def test_any_error_of_a_wish_is_told_and_the_view_goes_on(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_any_error_of_a_wish_is_reported_and_the_view_goes_on(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
     wish(viewer, ("play", None), ("seek", 1.0))
     kept = viewer._reel.frames
 
@@ -412,7 +412,7 @@ def test_any_error_of_a_wish_is_told_and_the_view_goes_on(viewer: Viewer, monkey
     assert "observer riccati" in viewer._panel._head.content and not viewer._panel._status.visible
 
 
-def test_the_end_is_told(viewer: Viewer) -> None:
+def test_the_end_is_reported(viewer: Viewer) -> None:
     wish(viewer, ("seek", 100.0), ("play", None))
     viewer.run(turns(3))
     assert not viewer.playing and "over" in viewer._panel._status.content
@@ -445,7 +445,7 @@ def test_a_kept_scene_is_shown_and_cannot_be_changed() -> None:
         reel.change(observer="robust")
 
 
-def test_a_port_that_is_taken_is_told() -> None:
+def test_a_port_that_is_taken_is_reported() -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()

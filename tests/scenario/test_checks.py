@@ -226,7 +226,7 @@ def test_an_accurate_estimate_does_not_feel_a_small_shift() -> None:
         assert angle.max() < 1e-9
 
 
-def test_an_unknown_field_is_told_without_the_names_of_all_fields() -> None:
+def test_an_unknown_field_is_reported_without_the_names_of_all_fields() -> None:
     with pytest.raises(ScenarioError, match=r"unknown field 'a'; known: .*\.\.\. \(\d+ in all\)$") as caught:
         load_scenario("overtaking", {"observation.scales": {"a": 1.0}})
     assert len(str(caught.value)) < 400

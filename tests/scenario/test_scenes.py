@@ -115,7 +115,7 @@ def test_a_ring_goes_round() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "message"),
     [
         ("lane:1", "scene lane: vehicles = '1', allowed are whole numbers 2 to 4096"),
         ("lane:many", "scene lane: vehicles = 'many', allowed are whole numbers 2 to 4096"),
@@ -133,10 +133,10 @@ def test_a_ring_goes_round() -> None:
         ("crossroad:9,lanes=1", "unknown option 'lanes'; allowed: vehicles (2..64), speed (1..50)"),
     ],
 )
-def test_a_wrong_name_is_told_in_one_line(name: str, told: str) -> None:
+def test_a_wrong_name_is_one_error_line(name: str, message: str) -> None:
     with pytest.raises(CoopenvError) as caught:
         load_scenario(name)
-    assert told in str(caught.value) and "\n" not in str(caught.value)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_paths_are_no_scenes() -> None:
@@ -154,8 +154,8 @@ def test_the_text_is_a_file_of_its_own(tmp_path: Path) -> None:
     file = tmp_path / "mine.toml"
     file.write_text(scene_text("tree:9"), encoding="utf-8")
     assert load_scenario(file) == made("tree:9")
-    told = environment_file("tree:9")
-    assert told.name == "tree_9.toml" and tomllib.loads(told.text or "") == tomllib.loads(scene_text("tree:9"))
+    file = environment_file("tree:9")
+    assert file.name == "tree_9.toml" and tomllib.loads(file.text or "") == tomllib.loads(scene_text("tree:9"))
 
 
 def test_as_many_vehicles_as_allowed_run() -> None:

@@ -65,12 +65,14 @@ def test_statistics_are_those_of_vehicles_under_way() -> None:
     actions = np.column_stack([np.ones(8), np.linspace(0.2, 0.5, 8)]).astype(np.float32)  # walls, one after another
     for _ in range(100):
         normalised, rewards, dones, infos = env.step(actions)
-        raw, plain, _, told = twin.step(actions)
+        raw, plain, _, plain_infos = twin.step(actions)
         seen.append(raw[twin.acted])
         assert rewards == pytest.approx(0.1 * plain)
         for row in np.flatnonzero(dones):
-            assert infos[row]["episode"]["r"] == pytest.approx(told[row]["episode"]["r"])
-            assert np.array_equal(infos[row]["terminal_observation"], env.normalise(told[row]["terminal_observation"]))
+            assert infos[row]["episode"]["r"] == pytest.approx(plain_infos[row]["episode"]["r"])
+            assert np.array_equal(
+                infos[row]["terminal_observation"], env.normalise(plain_infos[row]["terminal_observation"])
+            )
     assert not twin.acted.all()
     rows = np.concatenate(seen)
     assert env.statistics.mean == pytest.approx(rows.mean(axis=0), abs=1e-4)
@@ -106,7 +108,7 @@ def test_a_budget_in_minutes_is_spent_by_the_clock() -> None:
 
 
 @pytest.mark.parametrize("broken", ["weights", "exploration"])
-def test_a_policy_that_is_not_finite_is_told_in_one_line(broken: str) -> None:
+def test_a_policy_that_is_not_finite_is_one_error_line(broken: str) -> None:
     trainer = trainer_of(steps=1024)
     policy = trainer.model.policy
     with torch.no_grad():

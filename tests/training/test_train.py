@@ -103,8 +103,8 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "train.toml").write_text(SETTINGS)
     with chdir(folder), redirect_stdout(StringIO()) as printed:
         assert main(fresh("--json")) == 0
-    told = {row["metric"]: row for row in json.loads(printed.getvalue())["results"]}
-    assert told["e95_m"]["ci_low"] <= told["e95_m"]["mean"] <= told["e95_m"]["ci_high"]
+    metrics = {row["metric"]: row for row in json.loads(printed.getvalue())["results"]}
+    assert metrics["e95_m"]["ci_low"] <= metrics["e95_m"]["mean"] <= metrics["e95_m"]["ci_high"]
     return folder / "agent"
 
 
@@ -168,10 +168,10 @@ def test_a_training_that_diverges_says_so_and_keeps_its_checkpoint(
     (here / "train.toml").write_text(SETTINGS.replace("[ppo]", "[ppo]\nlearning_rate = 1e9"))
     for arguments in (fresh(), command("--resume")):
         assert main(arguments) == 2
-        *_, told = capsys.readouterr().err.splitlines()
-        assert told.startswith("error: the training diverged: after ")
-        assert f"ppo.learning_rate = {1e9}" in told
-        assert "agent/checkpoint.safetensors is kept as it was after 0 steps" in told
+        *_, error_text = capsys.readouterr().err.splitlines()
+        assert error_text.startswith("error: the training diverged: after ")
+        assert f"ppo.learning_rate = {1e9}" in error_text
+        assert "agent/checkpoint.safetensors is kept as it was after 0 steps" in error_text
         assert not (here / "agent" / "agent.toml").exists()
 
 
@@ -220,9 +220,9 @@ def test_a_truncated_checkpoint_is_one_line(left: int, here: Path, capsys: pytes
     path = here / "agent" / "checkpoint.safetensors"
     path.write_bytes(path.read_bytes()[:left])
     assert main(command("--resume")) == 2
-    told = capsys.readouterr().err
-    assert told.startswith("error: agent/checkpoint.safetensors: damaged, or not a checkpoint")
-    assert told.count("\n") == 1
+    error_text = capsys.readouterr().err
+    assert error_text.startswith("error: agent/checkpoint.safetensors: damaged, or not a checkpoint")
+    assert error_text.count("\n") == 1
 
 
 @pytest.mark.slow
@@ -286,8 +286,8 @@ def test_mistakes_are_one_line(
     arguments: list[str], message: str, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(arguments) == 2
-    told = capsys.readouterr().err
-    assert message in told and told.count("\n") == 1
+    error_text = capsys.readouterr().err
+    assert message in error_text and error_text.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -257,7 +257,7 @@ def test_topology_bars_are_the_stretches_of_each_sight(run: Trajectory) -> None:
     assert drawn == pytest.approx(run.visible[:, 0][:, [1, 2, 4]].sum() / 60, rel=0.02)
 
 
-def test_a_fixed_topology_is_told_in_words(run: Trajectory) -> None:
+def test_a_fixed_topology_is_described_in_words(run: Trajectory) -> None:
     neighbours = np.any(run.sight != Sight.NOT_A_NEIGHBOUR, axis=0)
     sight = np.where(neighbours, Sight.VISIBLE, np.zeros_like(run.sight))
     fixed = topology_figure(dataclasses.replace(run, sight=sight, visible=sight == Sight.VISIBLE))
@@ -299,7 +299,7 @@ def test_runs_cover_each_tick_until_the_next() -> None:
     assert style.runs(t, np.array([True, False, True, False]), 1.9) == [(0.0, 1.0), (3.0, 1.0)]
 
 
-def test_starts_of_truth_and_estimate_are_told_apart(run: Trajectory) -> None:
+def test_starts_of_truth_and_estimate_are_distinguished(run: Trajectory) -> None:
     figure = trajectory_figure_2d(run)
     handles = {str(line.get_label()): line for line in figure.legends[0].get_lines()}
     true, first = handles["true start"], handles["first estimate"]

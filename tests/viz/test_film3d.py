@@ -102,6 +102,6 @@ def test_a_driver_sees_targets_where_its_camera_images_them(frame: Frame) -> Non
     assert picture[round(v), round(u)].mean() < 70.0 < picture[round(v), round(u) - 40].mean()  # a landmark is dark
 
 
-def test_an_unknown_camera_is_told() -> None:
+def test_an_unknown_camera_is_reported() -> None:
     with pytest.raises(CoopenvError, match="unknown camera of a film 'above'; known: overview, follow, driver"):
         View3d(coopenv.load_scenario("facade"), SIZE, "above")

@@ -214,11 +214,11 @@ def test_a_page_holds_the_episode(tmp_path: Path) -> None:
     shares: list[float] = []
     path = write_replay(record, tmp_path / "replay.html", shares.append)
     page = path.read_text(encoding="utf-8")
-    length, told = messages(page)
+    length, sent = messages(page)
     assert length == pytest.approx(record.length)
-    times = [time for time, _ in told]
+    times = [time for time, _ in sent]
     assert times == sorted(times) and len(set(times)) == len(record)
-    moved = {message["name"] for time, message in told if time > 0 and message["type"] == "SceneNodeUpdateMessage"}
+    moved = {message["name"] for time, message in sent if time > 0 and message["type"] == "SceneNodeUpdateMessage"}
     assert {"/world/cars/true", "/world/estimates/body", "/world/ellipsoids", "/world/errors"} <= moved
     assert "urban_crossing, observer robust, seed 1" in page and "Urban crossing - coopenv</title>" in page
     assert GAIN not in page

@@ -26,7 +26,7 @@ def fleet(own: dict[int, dict[str, Any]], **sections: Any) -> Scenario:
     return scenario(vehicles, **sections)
 
 
-def told(state: State, vehicle: int) -> tuple[np.ndarray, np.ndarray]:
+def broadcast_error(state: State, vehicle: int) -> tuple[np.ndarray, np.ndarray]:
     """Return what a vehicle put on the air at the state's tick beside its estimate: shift (W, 3), turn (W, 3, 3)."""
     slot = int(state["tick"][0]) % state["outbox_tick"].shape[-1]
     shift = state["outbox_position"][:, vehicle, slot] - estimated_position(state)[:, vehicle]
@@ -37,10 +37,10 @@ def told(state: State, vehicle: int) -> tuple[np.ndarray, np.ndarray]:
 def test_a_jump_is_of_its_size_from_its_time_on() -> None:
     lie = {"kind": "jump", "start": 0.5, "offset": 3.0, "direction": [0.0, 3.0, 4.0]}
     for state in run(start(fleet({0: {"lie": lie}})), 60):
-        shift, turn = told(state, 0)
+        shift, turn = broadcast_error(state, 0)
         assert_allclose(shift[0], [0.0, 1.8, 2.4] if state["tick"][0] >= 30 else 0.0, atol=1e-12)
         assert_allclose(turn[0], np.eye(3), atol=1e-12)
-        assert_allclose(told(state, 1)[0], 0.0, atol=1e-12)
+        assert_allclose(broadcast_error(state, 1)[0], 0.0, atol=1e-12)
         assert_allclose(
             state["inbox_position"][0, 2, 0] - estimated_position(state)[0, 0], shift[0], atol=1e-12
         )  # all hear the same
@@ -50,7 +50,7 @@ def test_a_drift_grows_with_time() -> None:
     lie = {"kind": "drift", "start": 0.2, "speed": 0.3, "direction": [1.0, 0.0, 0.0]}
     for state in run(start(fleet({1: {"lie": lie}})), 40):
         expected = 0.3 * max(0.0, state["tick"][0] / 60 - 0.2)
-        assert_allclose(told(state, 1)[0][0], [expected, 0.0, 0.0], atol=1e-12)
+        assert_allclose(broadcast_error(state, 1)[0][0], [expected, 0.0, 0.0], atol=1e-12)
 
 
 def test_who_lies_when_and_where_to_is_drawn() -> None:
@@ -68,7 +68,7 @@ def test_who_lies_when_and_where_to_is_drawn() -> None:
     assert stats.kstest(np.arctan2(*vectors[:, :2].T) / (2 * np.pi) + 0.5, "uniform").pvalue > 1e-4
 
 
-def test_those_who_collude_tell_the_same() -> None:
+def test_colluding_vehicles_broadcast_the_same_error() -> None:
     lie = {"kind": "collude", "chance": 0.5, "start_spread": 1.0, "offset": 2.0}
     state = start(fleet({0: {"lie": lie}, 1: {"lie": lie}}), range(100)).get_state()
     assert_array_equal(state["lie_tick"][:, 0], state["lie_tick"][:, 1])
@@ -87,8 +87,8 @@ def test_a_lie_is_steered() -> None:
             world.advance(1)
             if world.view("tick")[0] > 12:
                 expected = expected + now / 60
-            assert_allclose(told(world.get_state(), 1)[0], expected, atol=1e-12)
-            assert_allclose(told(world.get_state(), 0)[0], 0.0, atol=1e-12)
+            assert_allclose(broadcast_error(world.get_state(), 1)[0], expected, atol=1e-12)
+            assert_allclose(broadcast_error(world.get_state(), 0)[0], 0.0, atol=1e-12)
         world.steer_lies(velocity)
         if world.view("tick")[0] >= 12:
             now = velocity[:, 1]
@@ -213,7 +213,7 @@ def test_messages_older_than_the_limit_by_the_receiver_s_clock_are_not_used() ->
 def test_corruption_alters_a_share_of_the_messages() -> None:
     corruption = {"probability": 0.3, "start": 0.25, "size": 4.0, "turn": 0.5}
     states = run(start(fleet({0: {"corruption": corruption}}), range(40)), 60)
-    shifts, turns = zip(*(told(state, 0) for state in states), strict=True)
+    shifts, turns = zip(*(broadcast_error(state, 0) for state in states), strict=True)
     shift, turn = np.array(shifts), np.array(turns)
     off = np.abs(shift).max(axis=-1) > 1e-9
     assert not off[:15].any()
@@ -224,7 +224,7 @@ def test_corruption_alters_a_share_of_the_messages() -> None:
         vectors = Rotation.from_matrix(turn[off]).as_rotvec()
         assert stats.kstest(vectors[:, axis] + 0.5, "uniform").pvalue > 1e-4
     assert_allclose(turn[~off], np.broadcast_to(np.eye(3), turn[~off].shape), atol=1e-12)
-    assert not any(np.abs(told(state, 1)[0]).max() > 1e-9 for state in states)
+    assert not any(np.abs(broadcast_error(state, 1)[0]).max() > 1e-9 for state in states)
 
 
 def test_a_restart_loses_all_at_the_next_decision() -> None:
@@ -237,7 +237,7 @@ def test_a_restart_loses_all_at_the_next_decision() -> None:
     world.advance(1)
     after = world.get_state()
     spread = [np.trace(state["covariance"][0, 1]) for state in (before, after)]
-    assert spread[1] > 3 * spread[0]  # 303 less what one frame has told
+    assert spread[1] > 3 * spread[0]  # 303 less the information of one frame
     middle = before["position"][0, :4].mean(axis=0)
     moved = np.linalg.norm(estimated_position(after)[0, 1] - middle)
     assert moved < np.linalg.norm(estimated_position(before)[0, 1] - middle)

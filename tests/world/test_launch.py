@@ -341,7 +341,7 @@ def test_a_read_only_cache_serves_what_it_has(doubled: Callable[[Path], list[flo
     assert doubled(disk) == [0.0, 2.0, 4.0]
 
 
-def test_a_full_disk_is_told_before_the_compiler_meets_it(program: Path, disk: Path) -> None:
+def test_a_full_disk_is_reported_before_the_compiler_meets_it(program: Path, disk: Path) -> None:
     with (disk / "filler").open("wb", buffering=0) as stream:
         while stream.write(bytes(1 << 16)) == 1 << 16:
             if stream.tell() > 18 << 20:

@@ -312,11 +312,11 @@ def test_off_draws_nothing() -> None:
     assert same_bits(silent["increment_rotation"], default["increment_rotation"])
 
 
-def test_truth_of_them_is_told_as_such() -> None:
+def test_their_truth_is_marked_as_truth() -> None:
     env = CooperativeLocalisationEnv(scenario([vehicle(motion=TURNING)], noise=ALL, camera=MISPLACED), "test")
     _, infos = env.reset(seed=1)
     truth, state = infos["vehicle_1"]["truth"], env.state()
     assert env.state_space.contains(state)
-    told = np.concatenate([np.ravel(truth[name]) for name in LASTING_ERRORS])
-    assert_allclose(state[-12:], told / LASTING_SCALE, atol=1e-5)
-    assert np.count_nonzero(told) == 10  # no slip yet
+    lasting = np.concatenate([np.ravel(truth[name]) for name in LASTING_ERRORS])
+    assert_allclose(state[-12:], lasting / LASTING_SCALE, atol=1e-5)
+    assert np.count_nonzero(lasting) == 10  # no slip yet

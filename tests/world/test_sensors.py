@@ -319,7 +319,7 @@ def test_without_it_nothing_changes() -> None:
 
 @pytest.mark.parametrize("observer", ["robust", "mekf_covariance"])
 def test_estimates_stay_consistent_while_it_pans(observer: str) -> None:
-    """Embedded and plug-in observers are told bearings in the body frame: ANEES over six stays about one."""
+    """Embedded and plug-in observers receive bearings in the body frame: ANEES over six stays about one."""
     worlds = 24 if observer == "robust" else 2
     starts = {"vehicles.*.initial_estimate": {"position_radius": 0.05, "orientation_angle": 0.02}}
     given = {**CROSSING, **starts, "action.longitudinal": "speed", "horizon": 8.0}

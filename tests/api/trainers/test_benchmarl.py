@@ -97,13 +97,13 @@ def test_log_info_is_of_vehicles_under_way(tmp_path: Path) -> None:
     trained, samples = experiment(tmp_path, MappoConfig)
     trained.run()
     batch = samples.batches[0]
-    told = trained.task.log_info(batch)
+    logged = trained.task.log_info(batch)
     rows = [row for world in batch for row in world]
     acting = [(row, i) for row in rows for i in range(4) if row["vehicle", "mask"][i]]
     errors = [row["next", "vehicle", "info", "position_error"][i].item() for row, i in acting]
     ends = sum(bool(row["next", "vehicle", "terminated"][i]) for row, i in acting)
-    assert told["collection/position_error"] == pytest.approx(np.mean(errors), rel=1e-4)
-    assert told["collection/arrived"] + told["collection/collided"] == ends > 0
+    assert logged["collection/position_error"] == pytest.approx(np.mean(errors), rel=1e-4)
+    assert logged["collection/arrived"] + logged["collection/collided"] == ends > 0
 
 
 def test_specs() -> None:

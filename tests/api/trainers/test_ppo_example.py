@@ -90,7 +90,7 @@ def test_statistics_are_those_of_all_rows_taken_in(ppo: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("weights", [{}, {"reward.weights.arrival": -5.0, "reward.weights.collision": -5.0}])
-def test_outcomes_are_told_whatever_is_paid_for_them(ppo: ModuleType, weights: dict[str, float]) -> None:
+def test_outcomes_are_reported_whatever_is_paid_for_them(ppo: ModuleType, weights: dict[str, float]) -> None:
     """Arrivals and collisions are counted by what the world says, not by the sign of the reward."""
     overrides = {"horizon": 20.0, **weights}
     env = coopenv.make_vec(FOUR_WAY, num_worlds=4, overrides=overrides, autoreset="disabled", arrays="torch")

@@ -105,7 +105,7 @@ def test_settings_that_changed_train_anew_what_was_interrupted(tmp_path: Path) -
     assert not kept.exists()
 
 
-def test_what_cannot_be_trained_is_told_before_anything_is(tmp_path: Path) -> None:
+def test_what_cannot_be_trained_is_reported_before_anything_is(tmp_path: Path) -> None:
     (tmp_path / "train.toml").write_text(
         SETTINGS
         + '[environments.open_square.arms.plain]\nscenario.observation.exclude = ["map"]\nclone.agent = "peek"\n'

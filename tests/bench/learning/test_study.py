@@ -94,16 +94,16 @@ def test_figures_stay_and_episodes_go(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("coopenv.bench.learning.drive", watched)
     judge = Judge(2)
 
-    def told(environment: str) -> tuple[list[Result], list[Difference]]:
+    def findings(environment: str) -> tuple[list[Result], list[Difference]]:
         return judge.results(environment, AGENTS[0]), judge.against(environment, *AGENTS)
 
-    square = told("open_square")
+    square = findings("open_square")
     expected = score(driven[0]()), compare_paired(driven[0](), driven[1]())
     assert repr(square) == repr(expected)  # some figures are no numbers, and equal all the same
-    facade = told("facade")
+    facade = findings("facade")
     gc.collect()
     assert [episodes() is None for episodes in driven] == [True, True, False, False]
-    assert (told("open_square"), told("facade")) == (square, facade)
+    assert (findings("open_square"), findings("facade")) == (square, facade)
     assert len(driven) == 4
     judge.results("facade", AGENTS[0], {"horizon": 5.0})
     assert len(driven) == 5

@@ -229,7 +229,7 @@ def test_the_steady_state_of_recorded_robots_lies_within_the_record(start: str, 
     assert "not within the run" in refused(*words, "--steady-from", start)
 
 
-def test_data_of_no_use_are_told_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_data_of_no_use_are_reported_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (mrclam_files.write(tmp_path, seconds=6.0) / "Robot5_Measurement.dat").write_text("")
     words = ["bench", "observers", "mrclam_6", "--data", str(tmp_path), "--observers", "mekf,dead_reckoning"]
     assert main([*words, "--jobs", "1"]) == 0
@@ -243,11 +243,11 @@ def test_what_cannot_be_compared_is_left_out_with_its_reason(
     monkeypatch.setattr(registry, "entry_points", lambda group: [EntryPoint("broken", "no_such_module:Thing", group)])
     short = ["--set", "horizon=0.1", "--seeds", "1", "--jobs", "1"]
     assert main(["bench", "observers", "crossing_path", "--variants", "all", *short]) == 0
-    told = capsys.readouterr()
-    left_out = {line.split()[2]: line for line in told.err.splitlines() if line.startswith("left out: ")}
+    both = capsys.readouterr()
+    left_out = {line.split()[2]: line for line in both.err.splitlines() if line.startswith("left out: ")}
     assert "no vehicle has another one as its neighbour" in left_out["lying_neighbour"]
     assert "no_such_module" in left_out["broken"]
-    assert "nominal" in told.out and "lying" not in told.out and "mekf" in told.out and "broken" not in told.out
+    assert "nominal" in both.out and "lying" not in both.out and "mekf" in both.out and "broken" not in both.out
     told_now = refused("bench", "observers", "crossing_path", "--observers", "mekf,broken", *short)
     assert "'broken' (no_such_module:Thing) cannot be loaded" in told_now
 

@@ -240,7 +240,7 @@ def makes() -> type:
         (["riccati"], {"overrides": {"horzon": 1.0}}, "did you mean 'horizon'"),
     ],
 )
-def test_mistakes_are_told_before_the_work(
+def test_mistakes_are_reported_before_the_work(
     monkeypatch: pytest.MonkeyPatch, observers: Any, options: dict[str, Any], message: str
 ) -> None:
     monkeypatch.setattr(registry, "_registered", {})

@@ -38,7 +38,7 @@ def made() -> Recording:
     return record(coopenv.load_scenario("busy_intersection", {"horizon": 0.1}), 0)
 
 
-def test_an_observer_starts_where_it_is_told() -> None:
+def test_an_observer_starts_at_the_given_estimate() -> None:
     started = random_start(made(), 7)
     result = run("mekf", started)
     assert_array_equal(result.rotation[0], started.start_rotation)
@@ -88,7 +88,7 @@ class RaisesUpsideDown(DeadReckoning):
         return 1 / 0 if estimate.rotation[2, 2] < 0 else estimate  # type: ignore[return-value]
 
 
-def test_failures_are_counted_and_told() -> None:
+def test_failures_are_counted_and_reported() -> None:
     factories = {"raises": RaisesUpsideDown, "mekf": find("mekf")}
     source = find_source("overtaking", {"horizon": 0.1})
     draws = [draw for seed in range(6) for draw in draw_starts(source, factories, seed)]
@@ -134,12 +134,12 @@ def test_all_vehicles_settle_under_the_papers_noise() -> None:
 def test_command(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["bench", "seeds", "overtaking", "--seeds", "2", "--set", "horizon=2.0"]
     assert main(words) == 0
-    told = capsys.readouterr().out
-    assert "vehicle_2" in told and "2/2" in told
+    printed = capsys.readouterr().out
+    assert "vehicle_2" in printed and "2/2" in printed
     assert main([*words, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["seeds"] == [0, 1]
     assert [vehicle["vehicle"] for vehicle in found["vehicles"]] == ["vehicle_1", "vehicle_2"]
     assert all(len(vehicle["position_rmse_m"]) == 2 for vehicle in found["vehicles"])
-    told = refused("bench", "seeds", "overtaking", "--steady-from", "99")
-    assert "steady_from 99 is not within the run of 45 s" in told
+    error_text = refused("bench", "seeds", "overtaking", "--steady-from", "99")
+    assert "steady_from 99 is not within the run of 45 s" in error_text

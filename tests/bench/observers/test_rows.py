@@ -88,7 +88,7 @@ def test_windows_end_with_the_run() -> None:
 
 
 @pytest.mark.parametrize("given", ["5", "5,4", "a,b", "-1,3", "1,inf", "1,1", ",".join(map(str, range(30)))])
-def test_edges_that_are_none_are_told(given: str) -> None:
+def test_invalid_edges_are_reported(given: str) -> None:
     with pytest.raises(CoopenvError, match=r"--windows .*expected 2 to 20 increasing times in s, such as 5,10,20,35"):
         checked_edges(given)
 
@@ -125,8 +125,8 @@ def test_the_command_writes_and_prints_them(tmp_path: Path, capsys: pytest.Captu
     assert main([*words, "--set", "horizon=1.0", "--jobs", "1", "--out", str(tmp_path / "new")]) == 0
     printed = capsys.readouterr().out
     assert max(len(line) for line in printed.splitlines() if not line.startswith("Files in")) <= 100
-    told = [line for line in printed.splitlines() if line.startswith("mekf_covariance 0.2-0.5 s")]
-    assert len(told) == 1 and told[0].split()[-1].startswith("f")
+    matching = [line for line in printed.splitlines() if line.startswith("mekf_covariance 0.2-0.5 s")]
+    assert len(matching) == 1 and matching[0].split()[-1].startswith("f")
     board = json.loads((tmp_path / "new" / "leaderboard.json").read_text())
     assert "--windows 0.2,0.5,2" in board["command"]
     with (tmp_path / "new" / "windows.csv").open() as file:

@@ -384,7 +384,7 @@ PLACE, ROTATION = np.array([0.7, -0.4, 0.1]), exp_so3(np.array([0.0, 0.0, 0.8]))
 ODOMETRY = np.array([0.0, 0.0, 0.3, 0.5, 0.2, 0.0])
 
 
-def told() -> VehicleBroadcast:
+def own_broadcast() -> VehicleBroadcast:
     extra = {"odometry": ODOMETRY, "depends_on": np.array([2], dtype=np.uint64)}
     covariance = np.diag([1e-3, 1e-3, 2e-3, 0.01, 0.02, 0.03])
     return VehicleBroadcast(0, ROTATION, PLACE, covariance, Message(PLACE, ROTATION, covariance, extra))
@@ -392,7 +392,7 @@ def told() -> VehicleBroadcast:
 
 @pytest.mark.parametrize(("role", "write"), [(Role.ESTIMATE, estimate_message), (Role.REPORT, report_message)])
 def test_what_one_says_is_where_the_other_hears_it(role: Role, write: Any) -> None:
-    message = decode(encode(write(told(), START, LAB)), SVEA.topics[role].type)
+    message = decode(encode(write(own_broadcast(), START, LAB)), SVEA.topics[role].type)
     place = getattr(message.pose, "pose", message.pose).position
     np.testing.assert_allclose([place.x, place.y, place.z], PLACE + LAB)  # as in the laboratory's coordinates
     assembler = begun(binding(2, only="car1", map={"origin": LAB.tolist()}), START - MS)

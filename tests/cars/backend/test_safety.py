@@ -186,9 +186,9 @@ class Yard:
         self.clock = GateClock(time.time_ns, time.monotonic_ns)
         self.links = {car: GateConnection(Gate(car, USUAL, self.clock), self.hub.connect()) for car in ("a", "b")}
         self.gates = Gates(self.hub.connect(), ("a", "b"), USUAL, None)
-        self.tell()
+        self.publish()
 
-    def tell(self) -> None:
+    def publish(self) -> None:
         for link in self.links.values():
             link.publish_status()
 
@@ -229,7 +229,7 @@ def test_an_emergency_stop_during_arming_holds(yard: Yard, monkeypatch: pytest.M
     pressed: list[bool] = []
 
     def during() -> None:
-        yard.tell()
+        yard.publish()
         slow.publish_status()
         if states(yard)[0] == "armed" and not pressed:
             pressed.append(True)
@@ -242,18 +242,18 @@ def test_an_emergency_stop_during_arming_holds(yard: Yard, monkeypatch: pytest.M
     )
     with pytest.raises(CoopenvError, match="a: was stopped while it was being armed"):
         yard.gates.begin()
-    yard.tell()
+    yard.publish()
     assert pressed and states(yard)[0] == "stopped"
 
 
 def test_who_has_stopped_a_car_is_known(yard: Yard) -> None:
     yard.gates.begin()
     yard.gates.stop()
-    yard.tell()
+    yard.publish()
     assert states(yard) == ["stopped", "stopped"] and not yard.gates.stopped_by_others
     yard.gates.begin()
     yard.stop("b")
-    yard.tell()
+    yard.publish()
     assert yard.gates.stopped_by_others == {"b"}
     with pytest.raises(CoopenvError, match="b: it was stopped elsewhere"):
         yard.gates.begin()
@@ -265,7 +265,7 @@ def test_what_a_gate_has_said_before_is_not_believed_again(yard: Yard) -> None:
     heard: list[Arrival] = []
     yard.hub.connect().subscribe(SVEA.topic_of("a", Role.GATE), heard.append)
     yard.gates.begin()
-    yard.tell()
+    yard.publish()
     first, topic = heard[0], SVEA.topic_of("a", Role.GATE)
     before = yard.gates.states["a"]
     yard.hub.connect().publish(topic, first.payload)
@@ -281,7 +281,7 @@ def test_a_gate_that_does_not_open_says_why(yard: Yard) -> None:
     yard.links["b"]._gate._check = refuse  # type: ignore[method-assign]
     with pytest.raises(CoopenvError, match=r"b: its gate refuses this end's signature: .*--station"):
         yard.gates.begin()
-    yard.tell()
+    yard.publish()
     assert states(yard) == ["disarmed", "disarmed"]
 
 
@@ -307,7 +307,7 @@ def live(yard: Yard, guard: Watchdog, monitor: LinkMonitor, seconds: float, usab
         monitor.looked = time.time_ns()
         if usable:
             monitor.put(sample("a", Role.WHEEL, monitor.looked, Twist(np.zeros(3), None)))
-        yard.tell()
+        yard.publish()
         guard.beat(0)
         time.sleep(0.01)
 
@@ -322,7 +322,7 @@ def test_bytes_alone_do_not_keep_a_car_going(guard: tuple[Yard, Watchdog, LinkMo
     assert dog.trip is None
     live(yard, dog, monitor, 5.0, usable=False)
     assert dog.trip is not None and "no usable new message on fleet/a/mavros/wheel" in dog.trip.reason
-    yard.tell()
+    yard.publish()
     assert states(yard) == ["stopped", "stopped"]
 
 
@@ -397,7 +397,7 @@ def armed() -> Talk:
 
 
 @pytest.mark.parametrize("left_out", [Role.REMOTE, Role.STATE, Role.BATTERY])
-def test_a_car_that_has_not_told_of_itself_is_not_armed(left_out: Role) -> None:
+def test_a_car_without_its_conditions_is_not_armed(left_out: Role) -> None:
     for old in ({}, {"age": 2.5}, {"age": -2.5}):  # silent, old, or of a clock that is far ahead
         talk = Talk()
         for role, say in ((Role.REMOTE, talk.remote), (Role.STATE, talk.state), (Role.BATTERY, talk.battery)):
@@ -452,7 +452,7 @@ def test_old_words_neither_stop_a_car_nor_keep_it_going(armed: Talk) -> None:
     assert armed.board.happened(CAR) == ""
 
 
-def test_cars_that_cannot_tell_are_armed_all_the_same() -> None:
+def test_cars_without_conditions_are_armed_if_none_are_required() -> None:
     talk = Talk(needed=False)
     assert talk.obstacle() == ""
     talk.board.begin()

@@ -156,7 +156,7 @@ KILLED = """
 recorder.write("frames", frame, 2)
 time.sleep(4 * FLUSH)
 recorder.tick(1, 3)
-recorder.stopped("told at once", "", 4)
+recorder.stopped("sent at once", "", 4)
 time.sleep(0.3)
 os.kill(os.getpid(), 9)
 """
@@ -284,8 +284,8 @@ def test_a_replay_says_what_the_live_run_said(recorded: Any, tmp_path: Path) -> 
     found = execute("lab", run, tmp_path / "out", log, {}, None, None, False)
     result = found.metrics
     report(run, found, tmp_path / "out", out)
-    told = text.getvalue()
-    assert f"Stopped: {REASON}" in told and "Replayed at" in told and "imulat" not in told
+    printed = text.getvalue()
+    assert f"Stopped: {REASON}" in printed and "Replayed at" in printed and "imulat" not in printed
     assert result["policy"] == "recorded" and live["policy"] == "route_follower"
     for key in ("vehicles", "outcome", "simulated_time_s"):
         np.testing.assert_equal(result[key], live[key])

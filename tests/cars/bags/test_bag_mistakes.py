@@ -243,7 +243,7 @@ def test_offsets_in_a_calibration_are_refused(topics: Path) -> None:
         load_map(topics)
 
 
-def test_a_folder_that_is_no_bag_is_told_so(topics: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_that_is_no_bag_is_an_error(topics: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = topics.with_name("empty")
     folder.mkdir()
     for command in ("run", "import"):
@@ -260,7 +260,7 @@ def test_a_topic_of_which_nothing_is_of_use(tmp_path: Path) -> None:
         opened(tmp_path, MAP, drive)
 
 
-def test_files_of_others_are_told_from_ours(
+def test_files_of_other_programs_are_distinguished(
     written: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     foreign, text = tmp_path / "foreign.mcap", tmp_path / "text.mcap"
@@ -274,7 +274,7 @@ def test_files_of_others_are_told_from_ours(
     assert is_bag(text, "topics.toml") and not is_bag("a\0b") and not is_bag("crossing_path")
 
 
-def test_the_camera_tells_its_own_calibration(tmp_path: Path) -> None:
+def test_the_camera_publishes_its_own_calibration(tmp_path: Path) -> None:
     matrices: dict[str, Any] = {"k": [400.0, 0, 160, 0, 410.0, 100, 0, 0, 1], "d": np.zeros(5)}
     fields = {**matrices, "height": 208, "width": 316, "distortion_model": "plumb_bob"}
     info = bags.Message("/agent8/pixy_node/camera_info", "sensor_msgs/msg/CameraInfo", 0, 0, fields)
@@ -372,7 +372,7 @@ def test_a_database_whose_messages_are_a_query_or_damaged(tmp_path: Path) -> Non
         BagFile(path)
 
 
-def test_the_imu_tells_turns_where_there_is_one(tmp_path: Path) -> None:
+def test_the_imu_measures_turns_where_there_is_one(tmp_path: Path) -> None:
     turning = {"angular_velocity": (0.0, 0.0, 0.7), "linear_acceleration": (0.0, 0.0, 9.8)}
     wheels = [m for m in short() if "twist" in m.topic]
     imu = [replace(m, topic="/imu", kind="sensor_msgs/msg/Imu", fields=turning) for m in wheels]
@@ -395,7 +395,7 @@ def test_frames_of_the_laboratory_become_the_environments(tmp_path: Path) -> Non
         assert_allclose(b.truth.rotation[0, :, 0], [-y, x, z], atol=1e-12)
 
 
-def test_a_camera_with_another_rate_is_told(tmp_path: Path) -> None:
+def test_a_camera_with_another_rate_is_reported(tmp_path: Path) -> None:
     with pytest.warns(DataWarning, match=r'60\.0 frames per second, the environment has 30: .* "rates.camera" = 60\.0'):
         opened(tmp_path, MAP.replace("[overrides]", '[overrides]\n"rates.camera" = 30.0\n"rates.observer" = 30.0'))
 

@@ -121,7 +121,7 @@ def test_leads_of_gyro_and_camera(offset: float) -> None:
     assert against is not None and against.seconds == pytest.approx(offset, abs=0.015)
 
 
-def test_a_motion_that_tells_nothing_has_no_lead() -> None:
+def test_a_motion_without_information_has_no_lead() -> None:
     t = np.arange(0.0, 20.0, 0.01)
     rng = np.random.default_rng(3)
     steady, noise = SampledSignal(t, 0.3 * t), SampledSignal.of_rates(t, rng.normal(0.0, 0.05, len(t)))

@@ -40,12 +40,12 @@ def commands(seconds: float, seed: int) -> np.ndarray:
 def measured() -> dict[str, Any]:
     """Return what a car measures, by steps of a millisecond."""
     latency, gain, turned, offset, down, up, rate, most, sharpest, lag, slow, bias, scale = TRUE
-    told, dt, rng = commands(50.0, 3), 0.001, np.random.default_rng(5)
+    commanded, dt, rng = commands(50.0, 3), 0.001, np.random.default_rng(5)
     t = np.arange(0.0, 49.9, dt)
-    row = np.searchsorted(told[:, 0], t - latency, side="right") - 1
-    wanted = np.where(row < 0, 0.0, gain * told[np.maximum(row, 0), 1])
+    row = np.searchsorted(commanded[:, 0], t - latency, side="right") - 1
+    wanted = np.where(row < 0, 0.0, gain * commanded[np.maximum(row, 0), 1])
     wanted[np.abs(wanted) < DEAD] = 0.0
-    angle = np.clip(np.where(row < 0, 0.0, turned * told[np.maximum(row, 0), 2]) + offset, -sharpest, sharpest)
+    angle = np.clip(np.where(row < 0, 0.0, turned * commanded[np.maximum(row, 0), 2]) + offset, -sharpest, sharpest)
     state, v, d = np.empty((len(t), 2)), 0.0, 0.0
     for k in range(len(t)):
         state[k] = v, d
@@ -57,9 +57,9 @@ def measured() -> dict[str, Any]:
     w, g, m = np.arange(3, len(t), 25), np.arange(7, len(t), 10), np.arange(0, len(t), 10)
     noise = rng.normal(size=len(m)) + 1j * rng.normal(size=len(m))
     return {
-        "command_time": told[:, 0],
-        "command_speed": told[:, 1],
-        "command_steering": told[:, 2],
+        "command_time": commanded[:, 0],
+        "command_speed": commanded[:, 1],
+        "command_steering": commanded[:, 2],
         "wheel_time": t[w],
         "wheel": (1.0 + scale) * state[w, 0] + 0.015 * rng.normal(size=len(w)) + 0j,
         "gyro_time": t[g],

@@ -25,11 +25,11 @@ def way_to_stand(profile: CarProfile, speed: float, cause: str) -> tuple[float, 
     stage = Stage("svea_overtaking", OVERTAKING[:2], {**EXACT, "dynamics.max_speed": 1.53}, profile=profile)
     gate = Gate("svea7", FAST, GateClock(lambda: stage.wall + stage.now, lambda: stage.now), profile=profile)
     assert gate.arrive(Role.ARM, messages.arm(stage.wall + stage.now, "s", gate.nonce, True)) is None
-    told: list[MotionCommand] = []
+    outputs: list[MotionCommand] = []
 
     def step() -> None:
         payload = gate.tick()
-        told.append(read_drive(payload, profile.command))
+        outputs.append(read_drive(payload, profile.command))
         stage.network.publish(profile.topic_of("svea7", Role.MANUAL), payload)
         stage.run(PERIOD * 1e-9)
 
@@ -39,7 +39,7 @@ def way_to_stand(profile: CarProfile, speed: float, cause: str) -> tuple[float, 
     for k in range(40):
         command(k)
         step()
-    world, told[:] = stage.cars["svea7"].world, []
+    world, outputs[:] = stage.cars["svea7"].world, []
     begin, way = stage.now, world.pose(world.agent)[1].copy()
     for k in count():
         if abs(world.twist[0][0]) <= 0.02:
@@ -53,7 +53,7 @@ def way_to_stand(profile: CarProfile, speed: float, cause: str) -> tuple[float, 
         else:
             step()
     reached = world.pose(world.agent)[1]
-    return (stage.now - begin) * 1e-9, float(((reached - way) ** 2).sum() ** 0.5), told
+    return (stage.now - begin) * 1e-9, float(((reached - way) ** 2).sum() ** 0.5), outputs
 
 
 @pytest.mark.parametrize("speed", rest_slow([0.41, 1.0, 1.5], 0, 2))

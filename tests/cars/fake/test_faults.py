@@ -140,7 +140,7 @@ def test_blocks_that_are_false_doubled_or_swapped(stage: Stage) -> None:
     assert sum(extra) == pytest.approx(30 * 1.9, rel=0.4)
 
 
-def test_every_kind_can_be_asked_for_and_nonsense_is_told(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_kind_can_be_asked_for_and_nonsense_is_reported(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
     for name, kind in FAKE_FAULTS.items():
         stage.ask(f"{name}={kind.high:g}@1000")
     assert not capsys.readouterr().err
@@ -148,6 +148,6 @@ def test_every_kind_can_be_asked_for_and_nonsense_is_told(stage: Stage, capsys: 
     stage.network.publish(fault_topic("svea7"), b"\1\2")
     stage.network.publish(SVEA.topic_of("svea7", Role.MANUAL), b"nonsense")
     stage.run(0.01)
-    told = capsys.readouterr().err.splitlines()
-    assert len(told) == 3 and told[0].startswith("svea7: unknown fault 'melt'")
+    error_lines = capsys.readouterr().err.splitlines()
+    assert len(error_lines) == 3 and error_lines[0].startswith("svea7: unknown fault 'melt'")
     assert np.isfinite(stage.pose("svea7")[1]).all()

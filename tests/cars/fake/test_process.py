@@ -53,7 +53,7 @@ def test_what_does_not_fit_is_one_line(fleet: Path) -> None:
     assert isinstance(result.exception, CoopenvError) and "unknown fault 'melt'" in str(result.exception)
 
 
-def test_a_gate_obeys_whom_it_is_told_to(fleet: Path) -> None:
+def test_a_gate_obeys_the_given_senders(fleet: Path) -> None:
     fleet.write_text(fleet.read_text() + '[security]\nkeys = "keys"\n')
     keys = fleet.parent / "keys"
     make_keys(keys, ["svea7", "svea1", "station"])

@@ -213,8 +213,8 @@ def endpoint() -> Iterator[str]:
 
 def test_the_node_needs_frames_a_calibration_and_opencv(fleet: Path, endpoint: str, tmp_path: Path) -> None:
     given = ("--car", "svea7", "--connect", endpoint, "--patience", "0.2")
-    told = see(str(fleet), *given)
-    assert told == "svea7: no calibration of its camera for 0.2 s on fleet/svea7/camera/camera_info"
+    printed = see(str(fleet), *given)
+    assert printed == "svea7: no calibration of its camera for 0.2 s on fleet/svea7/camera/camera_info"
     blind = tmp_path / "cv2.py"
     blind.write_text("raise ImportError")
     command = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(tmp_path)!r}); "

@@ -63,7 +63,7 @@ def test_a_good_file_is_read(tmp_path: Path) -> None:
         ("ros1", "tcp/127.0.0.1:11311", False),
     ],
 )
-def test_each_network_has_its_usual_place_and_the_authors_cars_need_not_tell_of_themselves(
+def test_each_network_has_its_usual_place_and_the_authors_cars_need_no_conditions(
     tmp_path: Path, kind: str, endpoint: str, tells: bool
 ) -> None:
     for safety, needed in (("", tells), ("conditions = false", False), ("conditions = true", True)):
@@ -74,8 +74,8 @@ def test_each_network_has_its_usual_place_and_the_authors_cars_need_not_tell_of_
 def test_a_gate_stays_on_its_car_wherever_the_network_is(tmp_path: Path) -> None:
     away = '[network]\nconnect = ["tcp/192.0.2.1:7447"]\n'
     assert load_deployment(written(tmp_path, GOOD + away)).gate_connect == ("tcp/127.0.0.1:7447",)
-    told = load_deployment(written(tmp_path, GOOD + away + '[gate]\nconnect = ["tcp/[::1]:1"]'))
-    assert told.gate_connect == ("tcp/[::1]:1",)
+    loaded = load_deployment(written(tmp_path, GOOD + away + '[gate]\nconnect = ["tcp/[::1]:1"]'))
+    assert loaded.gate_connect == ("tcp/[::1]:1",)
 
 
 FENCES = ("[[0, 0], [1, 0]]", "[[0, 0], [1, 1], [1, 0], [0, 1]]", "[[0, 0], [1, 0], [2, 0]]", str([[0, 0]] * 4))
@@ -186,7 +186,7 @@ NO_SIGNAL = "its remote control has no signal"
         ((1500,) * 4, "its remote control has 4 channels, remote.mode_switch is 5"),
     ],
 )
-def test_what_tells_nothing_is_said(pulses: tuple[int, ...], why: str) -> None:
+def test_readings_without_information_are_reported(pulses: tuple[int, ...], why: str) -> None:
     assert Remote().fault(pulses) == why
 
 

@@ -139,8 +139,8 @@ def test_poses_and_points() -> None:
         seen = read(Role.TRUTH, make("geometry_msgs/msg/PoseStamped", ros, pose=((1, 2, 3), turn.as_quat())))
         assert isinstance(seen, CarPose) and seen.rotation is not None
         assert_allclose(seen.rotation, turn.as_matrix(), atol=1e-12)
-    told = read(Role.POINT, make("geometry_msgs/msg/PointStamped", 1, point=(1, 2, 3)))
-    assert isinstance(told, CarPose) and told.position.tolist() == [1, 2, 3] and told.rotation is None
+    reading = read(Role.POINT, make("geometry_msgs/msg/PointStamped", 1, point=(1, 2, 3)))
+    assert isinstance(reading, CarPose) and reading.position.tolist() == [1, 2, 3] and reading.rotation is None
 
 
 def test_reports() -> None:
@@ -176,8 +176,8 @@ def test_status() -> None:
     for connected in (True, False):
         state = make("mavros_msgs/msg/State", connected=connected, armed=True, mode="MANUAL")
         assert read(Role.STATE, state) == CarStatus(armed=connected, mode="MANUAL")
-    for rssi, pulses, told in ((9, [1500, 1510], (1500, 1510)), (0, [1500, 1510], ()), (255, [], ()), (255, [0], (0,))):
-        assert read(Role.REMOTE, make("mavros_msgs/msg/RCIn", rssi=rssi, channels=pulses)) == CarStatus(pulses=told)
+    for rssi, pulses, kept in ((9, [1500, 1510], (1500, 1510)), (0, [1500, 1510], ()), (255, [], ()), (255, [0], (0,))):
+        assert read(Role.REMOTE, make("mavros_msgs/msg/RCIn", rssi=rssi, channels=pulses)) == CarStatus(pulses=kept)
     assert read(Role.BATTERY, battery(0.5)) == CarStatus(battery=0.5)
     assert read(Role.BATTERY, battery(float("nan"))) == CarStatus()
 
@@ -265,7 +265,7 @@ def test_the_simulator_undistorts_alike() -> None:
     assert_allclose(found, out.numpy(), atol=2e-5)  # whose fixed-point iteration stops after 20 rounds
 
 
-def test_points_that_no_ray_gives_are_told() -> None:
+def test_points_that_no_ray_gives_are_reported() -> None:
     reach = largest_radius(FISH)
     farthest = float(distort(np.array([[reach, 0.0]]), (*FISH[:2], 0.0, 0.0, 0.0))[0, 0])
     points = np.array([[0.1, 0.2], [farthest + 0.05, 0.0], [np.nan, 0.0], [0.0, 50.0]])

@@ -219,7 +219,7 @@ def test_outliers_are_dropped_and_doubtful_ones_count_less():
 
 
 def test_calibrates_scale_lead_and_camera_bias():
-    """A robot that turns 0.85 times what it is told, 0.25 s late, with its camera off by 0.015 rad."""
+    """A robot that turns 0.85 times its command, 0.25 s late, with its camera off by 0.015 rad."""
     rng = np.random.default_rng(3)
     scale, lead, bias, noise = 0.85, 0.25, 0.015, 0.02
     mean = (0.94, 1.0, 0.0, 0.0, 0.0, 0.15, 0.0, 1.0, 0.0)

@@ -113,7 +113,7 @@ def test_a_robot_that_is_seen_corrects_itself_once():
     again = seen.update(tick(setup(1), 3, {}, {2: Received(message, 0.10)}))
     assert abs(first.position[1]) < 0.1
     np.testing.assert_allclose(again.position, first.position, atol=1e-9)
-    assert not seer.message().extra  # each sighting is told once
+    assert not seer.message().extra  # each sighting is broadcast once
 
 
 def test_a_robot_corrects_itself_with_its_sighting():
@@ -226,17 +226,17 @@ def test_a_robot_that_is_unsure_of_its_heading_waits_for_a_bearing(seed, seconds
 def hostile() -> tuple[Message, ...]:
     """Return things that are no message."""
     p, P, nan = np.zeros(3), np.eye(3), np.nan
-    told = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1], np.float32)
-    extra = {"seen": np.arange(15, 20, dtype=np.uint8), "bearing": np.zeros(5, np.float32), "from": told}
+    origin = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1], np.float32)
+    extra = {"seen": np.arange(15, 20, dtype=np.uint8), "bearing": np.zeros(5, np.float32), "from": origin}
     return (
         Message(position=p, covariance=-P),
         Message(position=p + 1e7, covariance=P),
-        Message(extra={**extra, "from": -told}),
-        Message(position=p + nan, covariance=P, extra={**extra, "from": told + np.float32(nan)}),
+        Message(extra={**extra, "from": -origin}),
+        Message(position=p + nan, covariance=P, extra={**extra, "from": origin + np.float32(nan)}),
         Message(position=p, covariance=P + np.array([[0, 9, 0], [0, 0, 0], [0, 0, 0]])),
         Message(position=p + 1e300, covariance=1e300 * P),
         Message(position=p, covariance=nan * P, extra={**extra, "bearing": np.full(5, np.inf, np.float32)}),
-        Message(position=p[:2], covariance=P, extra={**extra, "from": told[:4]}),
+        Message(position=p[:2], covariance=P, extra={**extra, "from": origin[:4]}),
         Message(position=p, covariance=P[0], extra={**extra, "bearing": np.zeros(2, np.float32)}),
     )
 

@@ -91,7 +91,7 @@ def still(world: World, k: int, phase: np.ndarray) -> float:
     return 0.0
 
 
-def tell(name: str, lasting: dict[str, Any], nees: np.ndarray, errors: np.ndarray) -> None:
+def report(name: str, lasting: dict[str, Any], nees: np.ndarray, errors: np.ndarray) -> None:
     """Print ANEES with its standard error over worlds and the 95th percentile of position errors (`pytest -s`)."""
     worlds, e95 = np.nanmean(nees, axis=(0, 2)), 100.0 * np.nanpercentile(errors, 95)
     std = np.nanstd(worlds) / np.sqrt(len(worlds))
@@ -140,7 +140,7 @@ def test_driven_cars_know_their_errors() -> None:
 def test_a_whole_episode_on_prescribed_paths(lasting: dict[str, Any]) -> None:
     scenario = load_scenario("busy_intersection_tracking", ROBUST | lasting)
     nees, errors, _ = driven(scenario, still, 32, "float64", 40)
-    tell("tracking from 2 s on", lasting, nees[20:], errors[20:])
+    report("tracking from 2 s on", lasting, nees[20:], errors[20:])
     for part in (nees[20:150], nees[150:]):
         assert 0.5 < np.nanmean(part) < 1.5
     assert 0.8 < np.nanmean(nees[350:]) < 1.2
@@ -159,8 +159,8 @@ def test_drivers_know_their_errors(environment: str, agent: str, lasting: dict[s
     vehicles = np.where(known > 0, np.nansum(nees, axis=0) / np.maximum(known, 1), np.nan)
     std = np.nanstd(vehicles, axis=0) / np.sqrt((known > 0).sum(axis=0))
     means = np.nanmean(vehicles, axis=0)
-    told = ", ".join(f"{mean:.2f} +- {error:.2f}" for mean, error in zip(means, std, strict=True))
-    tell(f"{environment}, {agent}, by vehicle {told}", lasting, nees, errors)
+    summary = ", ".join(f"{mean:.2f} +- {error:.2f}" for mean, error in zip(means, std, strict=True))
+    report(f"{environment}, {agent}, by vehicle {summary}", lasting, nees, errors)
     assert ((means + 2.0 * std > 0.5) & (means - 2.0 * std < 1.5)).all()
 
 

@@ -90,9 +90,9 @@ def test_schemas_are_those_that_foxglove_publishes(crossing: Any) -> None:
         assert found[name].encoding == "protobuf"
         files = FileDescriptorSet.FromString(found[name].data).file
         (message,) = (m for f in files for m in f.message_type if f"{f.package}.{m.name}" == name)
-        told = {field.name: (field.number, field.type) for field in message.field}
+        found_fields = {field.name: (field.number, field.type) for field in message.field}
         for field in getattr(module, kind).DESCRIPTOR.fields:
-            assert told[field.name] == (field.number, field.type), f"{name}.{field.name}"
+            assert found_fields[field.name] == (field.number, field.type), f"{name}.{field.name}"
 
 
 def test_messages_come_in_the_order_of_time_with_wall_clock_stamps(crossing: Any) -> None:

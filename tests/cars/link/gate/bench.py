@@ -1,4 +1,4 @@
-"""A gate with clocks that stand still until they are told, its station, and messages that are not of its station."""
+"""A gate with clocks that stand still until a test advances them, its station, and messages of other senders."""
 
 from __future__ import annotations
 
@@ -67,19 +67,19 @@ class Bench:
         return decode(self.gate.status(), SVEA.topics[Role.GATE].type)
 
     def tick(self) -> MotionCommand:
-        """Return what the car is told after one more period."""
+        """Return the car's command after one more period."""
         self.wait(PERIOD)
         payload = self.gate.tick()
         assert stamp_of(decode(payload, SVEA.topics[Role.MANUAL].type)) == self.wall
         return read_drive(payload, SVEA.command)
 
     def drive(self, ticks: int, **fields: Any) -> MotionCommand:
-        """Return what the car is told after some commands, one per tick."""
-        told = MotionCommand()
+        """Return the car's command after some commands, one per tick."""
+        output = MotionCommand()
         for _ in range(ticks):
             assert self.command(**fields) is None
-            told = self.tick()
-        return told
+            output = self.tick()
+        return output
 
 
 Message = tuple[Role, bytes, bytes]

@@ -44,13 +44,13 @@ class Station:
         return dict(self._seen).get(presence_of(CAR), False)
 
     def since(self, when: float = 0.0) -> list[MotionCommand]:
-        """Return what the car has been told since an instant of the wall clock, s."""
-        told = []
+        """Return the car's commands since an instant of the wall clock, s."""
+        outputs = []
         for arrival in self._wheels.copy():
             if arrival.received >= 1e9 * when:
                 with suppress(Malformed):
-                    told.append(read_drive(arrival.payload, SVEA.command))
-        return told
+                    outputs.append(read_drive(arrival.payload, SVEA.command))
+        return outputs
 
     def count(self, reason: str) -> int:
         return int(dict(zip(self.status.rejections, self.status.counts, strict=True))[reason])
@@ -84,7 +84,7 @@ class Station:
         self.send(Role.COMMAND, messages.command(time.time_ns(), self.session, self.sequence, 0.1, speed))
 
     def drive(self) -> None:
-        """Send commands until the car is told to move."""
+        """Send commands until the gate commands the car to move."""
         begun = time.time()
 
         def moves() -> bool:

@@ -41,8 +41,8 @@ def test_it_starts_disarmed_and_neutral() -> None:
 def test_commands_of_the_armed_session_move_the_car() -> None:
     bench = armed()
     assert bench.tick() == NEUTRAL and bench.gate.state is GateMode.ARMED
-    told = bench.drive(10)
-    assert (told.steering, told.speed) == pytest.approx((0.1, 0.2), abs=1e-6)
+    output = bench.drive(10)
+    assert (output.steering, output.speed) == pytest.approx((0.1, 0.2), abs=1e-6)
     status = bench.status()
     assert (status.state, status.session, status.accepted, status.last_sequence) == ("armed", "s1", 10, 10)
     assert not status.counts.any()
@@ -52,9 +52,9 @@ def test_rates_are_limited_both_ways() -> None:
     bench = armed()
     speeds, angles = [0.0], [0.0]
     for steering, speed in [(0.5, 0.5)] * 15 + [(-0.5, 0.0)] * 15:
-        told = bench.drive(1, steering=steering, speed=speed)
-        speeds.append(told.speed)
-        angles.append(told.steering)
+        output = bench.drive(1, steering=steering, speed=speed)
+        speeds.append(output.speed)
+        angles.append(output.steering)
     for before, after in pairwise(speeds):
         assert abs(after - before) <= LIMITS.acceleration * 0.05 + 1e-6
     for before, after in pairwise(angles):
@@ -80,8 +80,8 @@ def test_without_commands_the_car_gets_neutral_and_newer_commands_go_on_from_a_s
     assert bench.status().session == "s1"
     assert bench.command(age=MOST_AGE + MS) is Reason.STALE
     assert bench.tick() == NEUTRAL
-    told = bench.drive(1)
-    assert told.speed == pytest.approx(0.05, abs=1e-6) and bench.gate.state is GateMode.ARMED
+    output = bench.drive(1)
+    assert output.speed == pytest.approx(0.05, abs=1e-6) and bench.gate.state is GateMode.ARMED
 
 
 def test_what_a_stalled_link_delivers_late_moves_nothing() -> None:
@@ -172,14 +172,14 @@ def test_a_command_names_session_and_sequence(frame: str, reason: Reason) -> Non
 def test_commands_are_finite_and_inside_the_limits(steering: float, speed: float) -> None:
     bench = armed()
     reason = bench.command(steering, speed)
-    told = bench.tick()
+    output = bench.tick()
     if not (math.isfinite(steering) and math.isfinite(speed)):
         assert reason is Reason.NOT_FINITE
     elif not (abs(steering) <= 0.5 + 1e-6 and -1e-6 <= speed <= 0.5 + 1e-6):
         assert reason is Reason.LIMITS
     else:
         assert reason is None
-    assert reason is None or told == NEUTRAL
+    assert reason is None or output == NEUTRAL
 
 
 def test_a_station_that_commands_what_is_no_number_stops_its_car_at_once() -> None:

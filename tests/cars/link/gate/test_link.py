@@ -64,7 +64,7 @@ def test_a_tick_sends_what_it_returns() -> None:
     assert decode(payloads[-1], SVEA.topics[Role.MANUAL].type).z == 500.0
 
 
-def test_news_is_told_at_once_and_its_own_stops_do_not_stop_it_again() -> None:
+def test_news_is_sent_at_once_and_its_own_stops_do_not_stop_it_again() -> None:
     link, station = pair()
     link.tick()
     station.send(Role.STOP, messages.stop())

@@ -62,8 +62,8 @@ def test_a_station_arms_drives_and_stops(station: Station) -> None:
     assert station.status.state == "disarmed"
     begun = time.time()
     time.sleep(0.6)
-    told, most = station.since(begun), 20.0 * (time.time() - begun) + 3
-    assert 3 <= len(told) <= most and set(told) == {NEUTRAL}  # 20 Hz, on a machine that has other things to do
+    outputs, most = station.since(begun), 20.0 * (time.time() - begun) + 3
+    assert 3 <= len(outputs) <= most and set(outputs) == {NEUTRAL}  # 20 Hz, on a machine that has other things to do
     station.arm("a")
     station.drive()
     wait_until(lambda: station.status.state == "timed_out")
@@ -180,7 +180,7 @@ def test_the_status_is_signed_by_the_car(endpoint: str, keys: Path, gate: subpro
     assert load_verifier(keys).signer(heard[0].topic, heard[0].payload, heard[0].attachment) == CAR
 
 
-def test_a_deployment_file_tells_it_all(endpoint: str, keys: Path, tmp_path: Path) -> None:
+def test_a_deployment_file_contains_all_settings(endpoint: str, keys: Path, tmp_path: Path) -> None:
     lines = [
         'environment = "none of its business"',
         f'cars = [{{name = "{CAR}"}}]',
@@ -208,7 +208,7 @@ def test_without_keys_it_warns(endpoint: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "text"),
     [
         (["--car", "a/b"], "--car 'a/b': expected"),
         (["--car", CAR, "--max-speed", "2"], "limit of speed: must be above 0, at most 1.53"),
@@ -223,8 +223,8 @@ def test_without_keys_it_warns(endpoint: str, tmp_path: Path) -> None:
         ([], "Missing option '--car'"),
     ],
 )
-def test_mistakes_are_told_in_one_line(
-    options: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+def test_a_mistake_is_one_error_line(
+    options: list[str], text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     fleet = f'environment = "x"\ncars = [{{name = "{CAR}"}}]\n'
@@ -235,7 +235,7 @@ def test_mistakes_are_told_in_one_line(
     Path("keys/station.pem").replace(f"keys/{CAR}.pem")
     assert main(["svea", "gate", *options]) == 2
     error = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: without --keys")]
-    assert len(error) == 1 and told in error[0]
+    assert len(error) == 1 and text in error[0]
 
 
 def test_it_loads_neither_the_simulation_nor_numpy() -> None:

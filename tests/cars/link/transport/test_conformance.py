@@ -184,11 +184,11 @@ def test_a_riccati_point_is_a_position_without_orientation_or_covariance() -> No
     plain.publish("agent8/riccatiPoint", POINT)
     assert [(a.topic, a.attachment) for a in heard] == [(HEARD, b"signed")]
     message = decode(heard[0].payload, SVEA.topics[Role.POINT].type)
-    told = read(Role.POINT, message)
-    assert isinstance(told, CarPose)
-    np.testing.assert_array_equal(told.position, [1.5, -2.0, 0.25])
-    assert told.rotation is None
-    assert told.covariance is None
+    reading = read(Role.POINT, message)
+    assert isinstance(reading, CarPose)
+    np.testing.assert_array_equal(reading.position, [1.5, -2.0, 0.25])
+    assert reading.rotation is None
+    assert reading.covariance is None
     assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == STAMP
 
 

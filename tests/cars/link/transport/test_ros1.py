@@ -135,5 +135,5 @@ def test_a_deployment_reaches_the_authors_stack(tmp_path: Path) -> None:
         message = encode(make("geometry_msgs/msg/PointStamped", header=header(5, "map"), point=(1.0, 2.0, 3.0)))
         wait_until(lambda: heard, lambda: station.publish(SVEA.topic_of("svea7", Role.POINT), message))
         station.close()
-    told = decode(heard[0].payload, SVEA.topics[Role.POINT].type).point
-    assert (told.x, told.y, told.z) == (3.0, 2.0, 1.0)
+    received_point = decode(heard[0].payload, SVEA.topics[Role.POINT].type).point
+    assert (received_point.x, received_point.y, received_point.z) == (3.0, 2.0, 1.0)
