@@ -63,7 +63,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ([*EVALUATE, "acts.py:Reset"], "the policy's reset failed at acts.py:18: ValueError: bad reset"),
         ([*EVALUATE, "acts.py:Init"], "agent 'Init' cannot be built: ZeroDivisionError: no"),
         ([*EVALUATE, "acts.py:Leaves"], "agent 'Leaves' cannot be built: SystemExit: 3"),
-        ([*EVALUATE, ","], "--agents ,: names none"),
+        ([*EVALUATE, ","], "--agents ,: names no agent"),
         ([*EVALUATE, "peek", "--set", "camera.range=nan"], "camera.range: Input should be a finite number, got nan"),
         ([*EVALUATE, "peek", "--out", "file"], "cannot write to file: it is not a folder"),
         ([*EVALUATE, "peek", "--worlds", "99999999999"], "Invalid value for '--worlds'"),

@@ -125,7 +125,7 @@ class SumoProgram(TrafficProgram):
         """
         i = self._index(vehicle)
         if np.isnan(self._last[i, 0]):
-            raise CoopenvError(f"{vehicle}: SUMO has it no more: it has left the road or reached the end of its route")
+            raise CoopenvError(f"{vehicle}: no longer in SUMO: it has left the road or reached the end of its route")
         self._taken[i] = False
 
     def _index(self, vehicle: str) -> int:

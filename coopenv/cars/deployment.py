@@ -68,7 +68,7 @@ class NetworkSettings(Section):
             if secure and self.tls is None:
                 raise ValueError(f"tls: is missing, {endpoint} needs at least its root_ca")
             if not secure and self.tls is not None and address_of(endpoint).protocol != UNIX:
-                raise ValueError(f"connect: {endpoint} would go in the clear; with network.tls it is tls/...")
+                raise ValueError(f"connect: {endpoint} is not encrypted; with network.tls, expected tls/...")
         return self
 
 

@@ -258,10 +258,10 @@ class CommandMessage(Section):
             if channel.change == 0.0:
                 raise ValueError(f"{name}.change: must not be 0")
         if self.steering.field == self.speed.field:
-            raise ValueError(f"speed.field: {shown(self.speed.field)} is that of the steering")
+            raise ValueError(f"speed.field: {shown(self.speed.field)} is steering.field, too")
         braking = self.brake.fields if self.brake else {}
         if braking and all(value == self.neutral.get(name, ("", None))[1] for name, value in braking.items()):
-            raise ValueError("brake.fields: are those of a standing car, so they brake nothing")
+            raise ValueError("brake.fields: equal a standing car's, so they brake nothing")
         for field in braking:
             if field not in self.neutral:
                 raise ValueError(f"brake.fields: {shown(field)} is no field of neutral")

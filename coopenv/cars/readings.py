@@ -209,7 +209,7 @@ def read(
     kind = getattr(message, "__msgtype__", type(message).__name__)
     readers = READERS.get(role, {})
     if kind not in readers:
-        raise CoopenvError(f"{role}: type {shown(kind)} is none of {listed(list(readers)) or 'those that are read'}")
+        raise CoopenvError(f"{role}: type {shown(kind)} is none of {listed(list(readers)) or 'the readable types'}")
     try:
         if role is Role.CAMERA_INFO:
             return calibration_of(message, vision.rectified)

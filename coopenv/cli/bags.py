@@ -27,13 +27,13 @@ def import_(
     overrides: options.Overrides = None,
     observer: options.LogObserver = None,
     scene: options.LogScene = True,
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     propose: Annotated[
         Path | None, typer.Option(help="TOML file to write: a map of the topics, by their types and names.")
     ] = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """List what ROS bags hold, and make a recording of them.
+    """List the topics of ROS bags, and make a recording of them.
 
     Files and folders of ROS 1 and ROS 2. Without --map: rates, gaps and stamps of their topics; --propose writes a map.
     """
@@ -89,7 +89,7 @@ def import_(
 
 
 def _print_topics(rows: Sequence[TopicRow], as_json: bool) -> None:
-    """Print what bags hold; where it is known, also as what it is read."""
+    """Print the topics of bags and, where known, their roles."""
     if as_json:
         options.print_json([*rows])
         return

@@ -51,7 +51,7 @@ class ObserverOptions:
     observers: Annotated[
         str | None,
         typer.Option(
-            help="Names of observers with commas between, or where classes stand, mine.py:Mine or package.module:Mine "
+            help="Names of observers with commas between, or import paths, mine.py:Mine or package.module:Mine "
             "(default: all that suit).",
             **options.OBSERVERS,
         ),
@@ -59,7 +59,7 @@ class ObserverOptions:
     variants: Annotated[
         str | None,
         typer.Option(
-            help="Names of variants with commas between, or `all`: faults of an environment, what recorded robots see."
+            help="Names of variants with commas between, or `all`: faults of an environment, or of recorded robots."
         ),
     ] = None
     faults: Annotated[
@@ -67,7 +67,7 @@ class ObserverOptions:
         typer.Option(
             "--fault",
             metavar="[VEHICLE:]NAME[=VALUE][@START[+DURATION]][,OPTION=VALUE...]",
-            help="One more variant with a fault (see `coopenv list variants`), times in s: gyro_bias=0.01 or "
+            help="Additional variant with a fault (see `coopenv list variants`), times in s: gyro_bias=0.01 or "
             "vehicle_2:lie=drift:0.05@10; commas between vehicles, / between faults. Repeatable.",
         ),
     ] = None
@@ -79,7 +79,7 @@ class ObserverOptions:
     first: First = 0
     jobs: Annotated[
         int | None,
-        typer.Option(min=1, help="Number of processes (default: one per core); 1 without limits: this very one."),
+        typer.Option(min=1, help="Number of processes (default: one per core); 1 without limits: this process."),
     ] = None
     engine: Annotated[str, typer.Option(help="Where to compute: `local`, or `ray` (an existing cluster).")] = "local"
     address: Annotated[str | None, typer.Option(help="Address of the Ray cluster, HOST:PORT (default: auto).")] = None
@@ -88,7 +88,7 @@ class ObserverOptions:
         typer.Option(min=0.1, help="Processor time after which an observer is ended on a record, s (default: 1800)."),
     ] = None
     memory: Annotated[
-        float | None, typer.Option(min=1, help="Memory beyond which it is ended, MiB (default: 8192).")
+        float | None, typer.Option(min=1, help="Memory beyond which an observer is ended, MiB (default: 8192).")
     ] = None
     data: options.DataFolder = None
     topics: options.TopicMap = None
@@ -137,7 +137,7 @@ class ObserverOptions:
 
 
 OF_THE_OUTPUT = ("jobs", "engine", "address", "seconds", "memory", "out", "figures", "width", "open_report", "as_json")
-"""Options of `bench observers` that do not change what is measured."""
+"""Options of `bench observers` that do not change the results."""
 
 
 @bench.command("observers")

@@ -1,4 +1,4 @@
-"""Options that several commands share, and what they are read into."""
+"""Options that several commands share, and their records."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def _check_observer(name: str) -> None:
 
 
 def each(check: Callable[[str], object]) -> Callable[[Any], Any]:
-    """Return what passes on several names, a list or a text with commas between, each of which a check accepts."""
+    """Return the check of several names, a list or a text with commas between, each by a check."""
 
     def checked(names: Any) -> Any:
         for name in names if isinstance(names, list) else words(names):
@@ -138,7 +138,7 @@ known_environments, known_agents = each(known_environment), each(_check_agent)
 
 
 def words(text: str | None) -> list[str]:
-    """Return what stands between commas."""
+    """Return the parts between commas."""
     return [word.strip() for word in (text or "").split(",") if word.strip()]
 
 
@@ -224,7 +224,7 @@ Connect = Annotated[
 GateConnect = Annotated[
     str | None,
     typer.Option(
-        help="Router on the car, that of its zenoh-bridge-ros2dds, in place of the deployment's gate.connect "
+        help="Router of the car's zenoh-bridge-ros2dds, in place of the deployment's gate.connect "
         "[default: tcp/127.0.0.1:7447].",
         show_default=False,
     ),
@@ -253,14 +253,14 @@ LogObserver = Annotated[
     str | None,
     typer.Option(
         "--observer",
-        help="Whose estimates are shown: a name, or mine.py:Mine (default: the scenario's own).",
+        help="Observer of the estimates: a name, or mine.py:Mine (default: the scenario's own).",
         **OBSERVERS,
         show_default=False,
     ),
 ]
 LogScene = Annotated[
     bool,
-    typer.Option("--scene/--no-scene", help="Also write what Foxglove and Lichtblick show: scene, cameras, estimates."),
+    typer.Option("--scene/--no-scene", help="Also write data for Foxglove and Lichtblick: scene, cameras, estimates."),
 ]
 TextFile = Annotated[Path | None, typer.Option(help="File to write (default: standard output).")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
@@ -299,7 +299,7 @@ class Grouped(TyperGroup):
 
 
 def usage_hint(error: Any) -> str:
-    """Return what follows the error of an option or argument that a command does not have; else an empty text."""
+    """Return the hint after the error of an unknown option or argument; else an empty text."""
     name, context = str(getattr(error, "option_name", "")), error.ctx
     if context is None or not (name or type(error) is typer.BadParameter.__base__):
         return ""
@@ -403,7 +403,7 @@ class SourceOptions:
         return parse_overrides(self.overrides)
 
     def open(self) -> Backend:
-        """Return where the ticks come from."""
+        """Return the source of ticks."""
         from coopenv.backends.sources import open_backend
 
         return open_backend(self.environment, None, self.changes, self.data, self.variant, topics=self.topics)

@@ -36,7 +36,7 @@ class RunOptions(options.SourceOptions):
     video: Annotated[bool, typer.Option("--video", help="Also write a video of the top view.")] = False
     open_out: Annotated[
         bool,
-        typer.Option("--open", help="Show the replay in a browser when it is done; the folder where there is none."),
+        typer.Option("--open", help="Show the replay in a browser when it is done, or else the folder."),
     ] = False
     as_json: options.AsJson = False
 
@@ -100,7 +100,7 @@ def replay(path: Path, as_json: bool = False) -> None:
     if others := bundle.other_versions():
         options.console(stderr=True).print(f"note: made with {', '.join(others)}", soft_wrap=True)
     if differing := bundle.replay():
-        raise CoopenvError(f"{path}: another result than that of the file: {'; '.join(differing)}")
+        raise CoopenvError(f"{path}: the result differs from the file's: {'; '.join(differing)}")
     if as_json:
         options.print_json(bundle.manifest.model_dump(include={"environment", "seed", "policy", "observer", "end"}))
         return
@@ -159,7 +159,7 @@ class RecordOptions(options.SourceOptions):
     observer: options.LogObserver = None
     scene: options.LogScene = True
     no_replay: Annotated[bool, typer.Option("--no-replay", help="Write no page that plays the episode.")] = False
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False
 
 
 @options.command

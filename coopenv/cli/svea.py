@@ -46,7 +46,7 @@ def demo(
     policy: options.PolicyName = "route_follower",
     seed: options.Seed = 0,
     seconds: Annotated[
-        float, typer.Option(min=0.0, help="Go on with further seeds until the cars have driven so long, s.")
+        float, typer.Option(min=0.0, help="Continue with further seeds up to this driving time, s.")
     ] = 0.0,
     beside: Annotated[
         bool, typer.Option("--beside", help="Simulate the same seeds, too, and print both side by side.")
@@ -72,22 +72,20 @@ def demo(
 
 @svea.command()
 def fake(
-    deployment: Annotated[Path, options.deployment(help="The fleet that it belongs to.")],
+    deployment: Annotated[Path, options.deployment(help="Deployment of the fleet.")],
     car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
     seed: options.Seed = 0,
     fault: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME[=VALUE][@START[+DURATION]]",
-            help="What goes wrong, from when on and for how long in s, e.g. loss=0.2@5+10. Faults: freeze, kill, loss, "
+            help="Fault with its start and duration in s, e.g. loss=0.2@5+10. Kinds: freeze, kill, loss, "
             "delay, clock_offset, clock_drift, wrong_stamps, false_blocks, duplicate_blocks, swapped_signatures. "
             "Repeatable.",
         ),
     ] = None,
     connect: options.Connect = None,
-    gate: Annotated[
-        bool, typer.Option(help="Whether commands come through a gate of its own; else it obeys ManualControl.")
-    ] = True,
+    gate: Annotated[bool, typer.Option(help="Use a gate for commands; otherwise the fake obeys ManualControl.")] = True,
     station: options.Station = None,
 ) -> None:
     """Let a fake car drive, see and send until it is interrupted; a line marks when it is ready."""
@@ -109,10 +107,10 @@ def fake(
         run(made, threading.Event())
 
 
-Speed = typer.Option(help="Most m/s [default: 0.5].", show_default=False)
-Angle = typer.Option(help="Most rad of steering [default: 0.5236].", show_default=False)
-Acceleration = typer.Option(help="Most m/s^2, either way [default: 1].", show_default=False)
-Rate = typer.Option(help="Most rad/s of steering [default: 2].", show_default=False)
+Speed = typer.Option(help="Largest speed, m/s [default: 0.5].", show_default=False)
+Angle = typer.Option(help="Largest steering angle, rad [default: 0.5236].", show_default=False)
+Acceleration = typer.Option(help="Largest acceleration and deceleration, m/s^2 [default: 1].", show_default=False)
+Rate = typer.Option(help="Largest steering rate, rad/s [default: 2].", show_default=False)
 
 
 @svea.command()
@@ -166,11 +164,11 @@ def gate(
 
 @svea.command()
 def health(
-    deployment: Annotated[Path, options.deployment(help="The fleet that the car belongs to.")],
+    deployment: Annotated[Path, options.deployment(help="Deployment of the fleet.")],
     car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
     connect: options.GateConnect = None,
     off_board: options.OffBoard = False,
-    patience: Annotated[float, typer.Option(min=0.1, help="s to wait for it.")] = 2.0,
+    patience: Annotated[float, typer.Option(min=0.1, help="Longest wait for it, s.")] = 2.0,
 ) -> None:
     """Print the next status of a car's gate, and try from outside a neutral command to the wheels.
 
@@ -239,11 +237,11 @@ def next_message(transport: "Transport", topic: str, kind: str, patience: float)
 
 @svea.command()
 def see(
-    deployment: Annotated[Path, options.deployment(help="The fleet that the car belongs to.")],
+    deployment: Annotated[Path, options.deployment(help="Deployment of the fleet.")],
     car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
     connect: options.GateConnect = None,
     off_board: options.OffBoard = False,
-    patience: Annotated[float, typer.Option(min=0.1, help="s to wait for the calibration of its camera.")] = 5.0,
+    patience: Annotated[float, typer.Option(min=0.1, help="Longest wait for the calibration of its camera, s.")] = 5.0,
 ) -> None:
     """Find the tags in a car's frames, the topic `detections`, and publish their bearings, until it is interrupted.
 
@@ -336,7 +334,7 @@ def attack(
     deployment: Annotated[Path, options.deployment(help="A fleet at a stand.")],
     commands: Annotated[int, typer.Option(min=1, help="Messages of all kinds together, at least.")] = 10_000,
     host: Annotated[
-        list[str] | None, typer.Option(help="Address of a car, whose open ports are looked for. Repeatable.")
+        list[str] | None, typer.Option(help="Address of a car, to scan for open ports. Repeatable.")
     ] = None,
     connect: options.Connect = None,
     seed: options.Seed = 0,
@@ -383,28 +381,26 @@ def attack(
 class SveaRunOptions:
     """Options of `coopenv svea run`."""
 
-    config: Annotated[Path, options.deployment(help="Which cars, and how they are reached.")]
+    config: Annotated[Path, options.deployment(help="Cars and their network.")]
     car: Annotated[
         str | None,
         typer.Option(help="Estimate and drive only this car, receive from others (default: all, as an edge server)."),
     ] = None
-    arm: Annotated[bool, typer.Option("--arm", help="Let the cars drive. Without it everything happens but that.")] = (
-        False
-    )
+    arm: Annotated[bool, typer.Option("--arm", help="Arm the cars. Without it, they stand; all else runs.")] = False
     release: Annotated[
-        bool, typer.Option("--release", help="With --arm: also cars that were stopped elsewhere. Know why, first.")
+        bool, typer.Option("--release", help="With --arm: also cars stopped by another station. Find the reason first.")
     ] = False
     policy: options.PolicyName = "zero"
     seed: options.Seed = 0
     steps: Annotated[int | None, typer.Option(min=1, help="Decisions to run (default: up to the horizon).")] = None
     connect: options.Connect = None
     record: Annotated[
-        Path | None, typer.Option(help="MCAP file for every message that comes or goes; coopenv run replays it.")
+        Path | None, typer.Option(help="MCAP file for every message received or sent; coopenv run replays it.")
     ] = None
     out: Annotated[Path | None, typer.Option(help="Folder of the results (default: out/DEPLOYMENT).")] = None
     overrides: options.Overrides = None
     steady_from: Annotated[
-        float, typer.Option(min=0.0, help="RMSE and NEES count from this time on, s: cars know their places by then.")
+        float, typer.Option(min=0.0, help="RMSE and NEES count from this time on, s: cars are localised by then.")
     ] = 2.0
     no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False
     as_json: options.AsJson = False

@@ -11,10 +11,10 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, needing
 from coopenv.cli import options
 
-Settings = Annotated[Path | None, typer.Option(help="TOML file of the settings (default: those of docs/trainers.md).")]
+Settings = Annotated[Path | None, typer.Option(help="TOML file of the settings (default: see docs/trainers.md).")]
 Agent = Annotated[
     str | None,
-    typer.Option(help="Agent beside which the settings stand, as train.toml.", **options.AGENT),
+    typer.Option(help="Agent with the settings, train.toml, in its folder.", **options.AGENT),
 ]
 Onnx = Annotated[bool, typer.Option("--onnx", help="Also write the policy as an ONNX model.")]
 
@@ -37,12 +37,12 @@ class TrainOptions:
     overrides: options.Overrides = None
     out: Annotated[Path | None, typer.Option(help="The agent's folder (default: out/train/ENV).")] = None
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from the checkpoint in the folder; options are those it began with.")
+        bool, typer.Option("--resume", help="Continue from the checkpoint in the folder, with its options.")
     ] = False
     threads: Annotated[int | None, typer.Option(min=1, help="Threads of the simulation (default: by cores).")] = None
     logs: Annotated[Path | None, typer.Option(help="Folder for TensorBoard (default: tensorboard/ in --out).")] = None
     onnx: Onnx = False
-    force: Annotated[bool, typer.Option("--force", help="Replace an agent that is in the folder.")] = False
+    force: Annotated[bool, typer.Option("--force", help="Replace the agent in the folder.")] = False
     as_json: options.AsJson = False
 
     def plan(self, folder: Path) -> Any:
@@ -69,7 +69,7 @@ class TrainOptions:
             f"--{name}": getattr(self, name) for name in ("agent", "settings", "arm", "seed", "steps", "minutes")
         }
         if named := [name for name, value in decided.items() if value is not None]:
-            raise CoopenvError(f"--resume goes on with what the training began with: leave out {', '.join(named)}")
+            raise CoopenvError(f"--resume continues with the options of the checkpoint: leave out {', '.join(named)}")
         plan = resumed_plan(folder)
         if plan.environment != self.environment:
             raise CoopenvError(f"{folder} holds a training of {plan.environment}, not of {self.environment}")
@@ -184,12 +184,12 @@ class EvaluateOptions:
     write_card: Annotated[
         bool, typer.Option("--write-card", help="Write the results to card.json and card.md in the agents' folders.")
     ] = False
-    force: Annotated[bool, typer.Option("--force", help="Replace an evaluation that is there.")] = False
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing evaluation.")] = False
     as_json: options.AsJson = False
 
 
 OF_THE_OUTPUT = ("out", "figures", "width", "no_figures", "film", "write_card", "force", "as_json")
-"""Options of `evaluate` that do not change what is measured."""
+"""Options of `evaluate` that do not change the results."""
 
 
 @options.command
@@ -204,7 +204,7 @@ def evaluate(given: EvaluateOptions) -> None:
         raise CoopenvError("--stress prints a table: leave out --film and --write-card")
     names = options.words(agents)
     if agents is not None and not names:
-        raise CoopenvError(f"--agents {agents}: names none; leave it out for all that were made for {environment}")
+        raise CoopenvError(f"--agents {agents}: names no agent; leave it out for all agents of {environment}")
     changes = options.parse_overrides(given.overrides)
     contest = cards.Contest.of(environment, changes, names, given.worlds, given.seed_block, given.ideal, given.stress)
     carded = cards.carded(contest) if given.write_card else []
@@ -251,7 +251,7 @@ class DatasetOptions:
     out: Annotated[
         Path | None, typer.Option(help="Folder of datasets (default: MINARI_DATASETS_PATH or ~/.minari/datasets).")
     ] = None
-    force: Annotated[bool, typer.Option("--force", help="Replace a dataset that is there.")] = False
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing dataset.")] = False
 
 
 @options.command

@@ -52,7 +52,7 @@ class SceneOptions(options.SourceOptions):
     seed: options.Seed = 0
 
     def open(self, more: Mapping[str, Any] | None = None) -> "Backend":
-        """Return where the ticks come from; `more` overrides of the scenario win over those that were given.
+        """Return the source of ticks; `more` overrides of the scenario win over the given ones.
 
         Raises:
             CoopenvError: there is no such source, or an option is not for it.
@@ -67,7 +67,7 @@ class SceneOptions(options.SourceOptions):
         return open_source(self.environment, changes, observer, self.data, self.variant, self.topics)
 
     def driver(self, scenario: "Scenario") -> "tuple[Policy | None, str]":
-        """Return who drives in a scenario, and its name. Raises CoopenvError: it cannot drive here."""
+        """Return the driver of a scenario, and its name. Raises CoopenvError: it cannot drive here."""
         from coopenv.runs.scenes import LOOKING, driver_of
 
         return driver_of(self.agent, scenario, self.environment, self.seed, LOOKING)
@@ -127,7 +127,7 @@ class FilmOptions(SceneOptions):
         ),
     ] = "overview"
     vehicle: Annotated[
-        str | None, typer.Option(help="With --3d: vehicle that is followed, or whose camera it is (default: f1).")
+        str | None, typer.Option(help="With --3d: vehicle to follow, or of the camera (default: f1).")
     ] = None
     headings: Annotated[
         str | None, typer.Option(help="Headings of films side by side, with commas between (default: their names).")
@@ -232,7 +232,7 @@ class ViewOptions(SceneOptions):
     connect: options.Connect = None
 
     def open(self, more: Mapping[str, Any] | None = None) -> "Backend":
-        """Return where the ticks come from, of cars as well."""
+        """Return the source of ticks, cars included."""
         if self.environment != CARS or self.deployment is None:
             return super().open(more)
         from coopenv.cars.backend.backend import open_svea

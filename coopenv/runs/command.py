@@ -272,7 +272,7 @@ class Results(Tabular):
             metrics.setdefault("observer", "unknown observer")  # of a run before 0.2
             ends = [row["ended_at_s"] for row in metrics["vehicles"]]
         except (KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path}: vehicles are not those of {TRAJECTORY_FILE} ({error})") from None
+            raise DataError(f"{path}: vehicles differ from {TRAJECTORY_FILE}'s ({error})") from None
         if not all(end is None or isinstance(end, float | int) for end in ends):
             raise DataError(f"{path}: ended_at_s: expected numbers")
         metrics |= {key: _with_nan(metrics[key]) for key in ("vehicles", "without_truth")}

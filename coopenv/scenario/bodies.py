@@ -120,7 +120,7 @@ class WaypointMotion(Section):
             raise ValueError("waypoint times must start at 0 and increase")
         for n, (a, b) in enumerate(pairwise(self.waypoints)):
             if math.dist(a.position, b.position) > FASTEST * (b.time - a.time):
-                raise ValueError(f"waypoints.{n + 1}: to be there in time takes more than {FASTEST:g} m/s")
+                raise ValueError(f"waypoints.{n + 1}: reaching it in time takes more than {FASTEST:g} m/s")
         return self
 
 
@@ -336,7 +336,7 @@ class LandmarkGroup(Section):
     @model_validator(mode="after")
     def _is_somewhere(self) -> Self:
         if bool(self.boxes) == bool(self.lines):
-            raise ValueError("give boxes or lines, one of them")
+            raise ValueError("give either boxes or lines")
         if self.height[0] > self.height[1]:
             raise ValueError(f"height: the lowest is {self.height[0]:g} m, the highest {self.height[1]:g} m")
         for i, line in enumerate(self.lines):

@@ -196,7 +196,7 @@ class TrainingPlan:
         for (name, change), scenario in zip(changes, [plain, *varied], strict=True):
             here = _meaning(scenario)
             if differing := [key for key in {**judged, **here} if here.get(key) != judged.get(key)]:
-                raise CoopenvError(f"{name}: {change} changes what entries mean: {listed(differing, 4)}")
+                raise CoopenvError(f"{name}: {change} changes the meaning of entries: {listed(differing, 4)}")
         found = [(s, max(1, round(own.share * worlds))) for s, own in zip(varied, settings.variations, strict=True)]
         left = worlds - sum(count for _, count in found)
         if left > 0 or not found:
@@ -211,7 +211,7 @@ def _meaning(scenario: Scenario) -> dict[str, object]:
         **layout,
         "actions": layout.actions,
         **settings_of_meaning(scenario, layout),
-        "who acts": any(scenario.acting),
+        "driven vehicles": any(scenario.acting),
     }
 
 

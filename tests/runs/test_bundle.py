@@ -171,7 +171,7 @@ def test_a_run_is_replayed_and_differences_are_named(folder: Path, capsys: pytes
         actions, position = kept["actions"], kept["state.position"]
     assert len(actions) == 30 and np.abs(actions).max() > 0.1
     other = edited(folder / "run.zip", lambda parts: arrays(parts, actions=-actions))
-    assert "another result than that of the file: state at 2 s:" in (line := refused("run", other))
+    assert "the result differs from the file's: state at 2 s:" in (line := refused("run", other))
     assert "last position error" in line
     other = edited(folder / "run.zip", lambda parts: arrays(parts, **{"state.position": position + 1e-3}))
     assert refused("run", other).endswith("state at 2 s: position\n")
@@ -194,7 +194,7 @@ def test_what_is_no_such_file_is_refused_in_one_line(folder: Path) -> None:
     cases: list[tuple[Callable[[dict[str, bytes]], None], bool, str]] = [
         (lambda parts: arrays(parts, actions=np.zeros((4, 1, 2))), False, "arrays.npz: not the part that was written"),
         (manifest("observer", "riccati"), False, "manifest.json: not the part that was written, its digest differs"),
-        (manifest("kernels", {"a": "b"}), True, "another result than that of the file: kernels coopenv."),
+        (manifest("kernels", {"a": "b"}), True, "the result differs from the file's: kernels coopenv."),
         (lambda parts: arrays(parts, pack=np.savez_compressed), True, "arrays.npz: is packed twice"),
         (lambda parts: arrays(parts, actions=np.full((4, 1, 2), 7.0)), True, "actions: expected numbers from -1 to 1"),
         (lambda parts: arrays(parts, actions=np.zeros((4, 9, 2))), True, "actions: expected (1, 2) per decision"),
@@ -205,7 +205,7 @@ def test_what_is_no_such_file_is_refused_in_one_line(folder: Path) -> None:
         (manifest("end", 3), True, "manifest.json: end: "),
         (manifest("kernels", 5), True, "manifest.json: kernels: "),
         (lambda parts: lacking(parts, "versions"), True, "manifest.json: versions: Field required"),
-        (manifest("ticks_planned", 10**12), True, "another result than that of the file: after tick 13: no error"),
+        (manifest("ticks_planned", 10**12), True, "the result differs from the file's: after tick 13: no error"),
         (manifest("state_tick", 10**6), True, "manifest.json: state_tick: later than the end"),
         (lambda parts: parts.update({"scenario.json": b'{"horizon": -1}'}), True, "scenario.json: "),
         (lambda parts: parts.update({"scenario.json": b"[1]"}), True, "scenario.json: not a scenario"),

@@ -85,7 +85,7 @@ def test_what_is_no_run_is_one_line(folder: Path, tmp_path: Path) -> None:
     metrics = json.loads((folder / "metrics.json").read_text())
     metrics["vehicles"][0]["vehicle"] = "vehicle_9"
     (tmp_path / "other" / "metrics.json").write_text(json.dumps(metrics))
-    assert "vehicles are not those of trajectory.npz" in said("other")
+    assert "vehicles differ from trajectory.npz's" in said("other")
     (tmp_path / "other" / "trajectory.npz").write_text("no archive")
     assert "trajectory.npz: not a readable trajectory" in said("other")
     whole = (folder / "trajectory.npz").read_bytes()

@@ -87,11 +87,11 @@ def test_shares_of_the_worlds_to_learn_in_differ(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "error"),
     [
-        ({"observation.map_size": 2}, "changes what entries mean: map_"),
-        ({"observation.planar": False}, "changes what entries mean: goal"),
-        ({"dynamics.max_speed": 3.0}, "changes what entries mean: .*dynamics.max_speed"),
-        ({"rates.decision": 5.0}, "changes what entries mean: rates.decision"),
-        ({"vehicles.0.motion.driver": "peek"}, "changes what entries mean: who acts"),
+        ({"observation.map_size": 2}, "changes the meaning of entries: map_"),
+        ({"observation.planar": False}, "changes the meaning of entries: goal"),
+        ({"dynamics.max_speed": 3.0}, "changes the meaning of entries: .*dynamics.max_speed"),
+        ({"rates.decision": 5.0}, "changes the meaning of entries: rates.decision"),
+        ({"vehicles.0.motion.driver": "peek"}, "changes the meaning of entries: driven vehicles"),
         ({"camera.range": -1}, "camera.range"),
     ],
 )

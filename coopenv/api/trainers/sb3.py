@@ -210,7 +210,7 @@ def make_sb3_vec_env(name_or_path: ScenarioLike, *, seed: int | None = None, **o
         CoopenvError: any argument is not valid.
     """
     if isinstance(name_or_path, CooperativeVectorEnv):
-        raise CoopenvError("make_sb3_vec_env takes what make_vec takes; of a batch: CooperativeSB3VecEnv(batch)")
+        raise CoopenvError("make_sb3_vec_env takes the arguments of make_vec; for a batch: CooperativeSB3VecEnv(batch)")
     for name in ("autoreset", "arrays"):
         if name in options:
             raise CoopenvError(f"make_sb3_vec_env chooses {name} itself: SB3 resets in the same step and takes NumPy")

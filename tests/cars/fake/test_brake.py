@@ -84,5 +84,5 @@ def test_a_brake_needs_fields_of_the_message() -> None:
     with pytest.raises(ValidationError, match=r"brake.fields: 'w' is no field of neutral"):
         type(SVEA.command)(**given)
     given["brake"]["fields"] = {"x": 0.0, "z": 500.0}
-    with pytest.raises(ValidationError, match=r"brake.fields: are those of a standing car"):
+    with pytest.raises(ValidationError, match=r"brake.fields: equal a standing car"):
         type(SVEA.command)(**given)
