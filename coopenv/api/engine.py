@@ -63,12 +63,12 @@ class Engine:
         """Build everything; arguments and errors as for `World`.
 
         Args:
-            scenario: what to build.
-            worlds: how many.
+            scenario: scenario of all worlds.
+            worlds: number of worlds.
             dtype: "float32" or "float64".
             device: "cpu" or a CUDA device.
             threads: shares of the batch on the CPU.
-            backend: where ticks come from (None: computed).
+            backend: source of ticks (None: simulated).
             reward: in place of the scenario's weighted sums, before a team's; on the CPU only.
 
         Raises:
@@ -150,7 +150,7 @@ class Engine:
             raise CoopenvError("step() called before reset()")
 
     def load(self) -> None:
-        """Load all kernels, compiling those that this machine has not compiled yet; nothing moves."""
+        """Load all kernels, compiling the missing ones; nothing moves."""
         (self.plugins or self.world).load()
         self._own_terms.end_episodes()
         self._fill("load", self._nowhere, self._nowhere)
@@ -191,7 +191,7 @@ class Engine:
             self._start_on_host(self.world.mask.numpy() != 0)
 
     def _start_on_host(self, chosen: np.ndarray) -> None:
-        """Start what runs on the host in worlds (W,) that have just been reset: observers and scripted drivers."""
+        """Start the observers and scripted drivers on the host in worlds (W,) that have just been reset."""
         if self.plugins is not None:
             self.plugins.start(np.flatnonzero(chosen))
         if self.scripted is not None:
@@ -207,7 +207,7 @@ class Engine:
                 self.set_actions(actions)
 
     def _fill(self, key: str, fresh: Any, chosen: Any, stepped: bool = False) -> None:
-        """Compute the results of the worlds in `chosen` (W,); in those of `fresh` (W,) an episode has just begun.
+        """Compute the results of the worlds in `chosen` (W,); in the worlds of `fresh` (W,) an episode has just begun.
 
         After a step, the reward of a function in Python, if there is one, is each vehicle's own; 0 in fresh worlds.
         """
@@ -526,7 +526,7 @@ class PlugIns:
         return [group.get_state() for group in self.groups]
 
     def set_state(self, states: Any, begun: np.ndarray) -> None:
-        """Go back to what `get_state` returned, of worlds (W,) of which some have begun.
+        """Restore a state of `get_state`, of worlds (W,) of which some have begun.
 
         Raises:
             CoopenvError: it is of other observers; nothing has changed then.

@@ -36,7 +36,7 @@ class Followed(TrafficProgram):
     present: Poses
 
     def __init__(self, scenario: Scenario) -> None:
-        """Follow what the wrapper puts into `present`."""
+        """Follow the wrapper's `present`."""
 
     def reset(self, seed: int) -> None:
         """Begin where the vehicles stand."""
@@ -45,7 +45,7 @@ class Followed(TrafficProgram):
         """Do nothing: the environment has moved them."""
 
     def poses(self) -> Poses:
-        """Return where they stand."""
+        """Return their positions."""
         return self.present
 
 
@@ -84,8 +84,8 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
             scenario: name or file with the sensors, the observer and the landmarks; its vehicles give way to the cars.
             sensing: the scenario's key: "ideal" measures every target in every frame, "sensed" what is in view, "blind"
                 nothing; None: as the scenario says.
-            connected: how many cars of the traffic are connected at most: those that are nearest at the start.
-            lane_keeping: whether the car's own control, such as highway-env's lane keeping, acts on its estimate too.
+            connected: largest number of connected cars of the traffic: the nearest ones at the start.
+            lane_keeping: let the car's own control, such as highway-env's lane keeping, use its estimate, too.
             overrides: dotted keys of the scenario.
 
         Raises:
@@ -126,7 +126,7 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observation, reward, terminated, truncated, self._with_localisation(info)
 
     def _board(self) -> None:
-        """Find the cars of this episode, and hook into what moves and observes them."""
+        """Find the cars of this episode, and hook into their motion and observation."""
         road, agents = self.highway.road, self.highway.controlled_vehicles
         if len(agents) != 1:
             raise CoopenvError(f"EstimatedKinematics takes environments with one agent, this one has {len(agents)}")

@@ -307,7 +307,7 @@ NUMBERS = ("position_error", "orientation_error", "nees", "arrived", "collided")
 
 
 class PlainInfos(BaseParallelWrapper[str, Any, np.ndarray]):
-    """Keeps what is a number of each info, and drops the actions of vehicles that have ended.
+    """Keeps the numbers of each info, and drops the actions of vehicles that have ended.
 
     RLlib keeps infos for whole episodes; other libraries make tensors of them, and send actions for all agents. Truth
     is left out, so that no policy can be built on it by accident.

@@ -333,7 +333,7 @@ class ActingRows(VectorWrapper):
 
     @property
     def num_envs(self) -> int:  # type: ignore[override]
-        """Number of rows, those of the acting vehicles of all worlds."""
+        """Number of rows, one per acting vehicle of every world."""
         return int(self._acting.sum())
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

@@ -88,7 +88,7 @@ class Health:
     missing: int = 0  # rows of vehicles from which nothing came
     empty: int = 0  # rows in which nothing was detected
     received: int = 0  # messages from vehicles or sensors, of any kind
-    rejected: int = 0  # those of them that were refused
+    rejected: int = 0  # messages of these that were refused
 
     def count(self, tick: Sensed, vehicles: Any = slice(None)) -> None:
         """Count one tick, in the rows of some vehicles, or of all."""
@@ -155,7 +155,7 @@ class Broadcasting(Protocol):
 
 @runtime_checkable
 class Repeating(Protocol):
-    """A backend whose episodes have been before: what a reset draws is what was drawn then."""
+    """A backend of past episodes: a reset repeats their draws."""
 
     stopped: str
     """Why the vehicles were stopped in the episode that has been replayed; empty: it is not over, or they were not."""
@@ -256,7 +256,7 @@ class SensingWorld(World, ABC):
 
     @abstractmethod
     def sensed(self, world: int, k: int) -> Sensed:
-        """Return what the vehicles of one world sense at the present tick k, without truth and messages."""
+        """Return the measurements of one world's vehicles at the present tick k, without truth and messages."""
 
     def fetch(self) -> bool:
         """Make the next tick ready for `sense`; return False where the source has no more."""

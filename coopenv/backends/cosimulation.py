@@ -80,7 +80,7 @@ class TrafficProgram(ABC):
 
     @abstractmethod
     def poses(self) -> Poses:
-        """Return where everything is after the last reset or command."""
+        """Return all poses after the last reset or command."""
 
     def save(self) -> Any:
         """Return a copy of everything that the next tick depends on."""
@@ -91,7 +91,7 @@ class TrafficProgram(ABC):
         return type(saved) is type(self)
 
     def restore(self, saved: Any) -> None:
-        """Go on from what `save` returned."""
+        """Continue from a state of `save`."""
         vars(self).update(vars(deepcopy(saved)))
 
     def close(self) -> None:  # noqa: B027 (most programs hold nothing)
@@ -117,7 +117,7 @@ class CosimulatedWorld(SimulatedWorld):
     def __init__(
         self, program: Callable[[Scenario], TrafficProgram], scenario: Scenario, *arguments: Any, **options: Any
     ) -> None:
-        """Build the arrays and start the programs; arguments and errors as for `World`, and those of the program.
+        """Build the arrays and start the programs; arguments and errors as for `World`, and the program's errors.
 
         Raises:
             CoopenvError: not on the CPU.
@@ -177,7 +177,7 @@ class CosimulatedWorld(SimulatedWorld):
         )
 
     def _poses(self, world: int) -> Poses:
-        """Return what a program states, checked, with absent bodies up to the most that there can be."""
+        """Return a program's poses, checked, with absent bodies up to the largest number."""
         poses, most = self.programs[world].poses(), self.model.traffic
         if not isinstance(poses, Poses):
             raise CoopenvError(f"{type(self.programs[world]).__name__}.poses: expected Poses, got {shown(poses)}")

@@ -38,7 +38,7 @@ BY_RADIO = wp.constant(-2)
 
 @wp.func
 def row_of(record: Any, tick: int) -> int:
-    """Return where a tick stands in a record; a record of one tick holds the present one."""
+    """Return the index of a tick in a record; a record of one tick holds the present one."""
     return wp.min(tick, record.last)
 
 
@@ -93,7 +93,7 @@ def explain(model: Any, state: Any, world: int, vehicle: int):
 
 @wp.func
 def recall(model: Any, state: Any, record: Any, world: int, tick: int):
-    """Write what was sensed at a tick, and the truth that is known."""
+    """Write the measurements of a tick, and the known truth."""
     row = row_of(record, tick)
     for landmark in range(model.landmarks):
         state.position[world, landmark] = record.landmarks[row, landmark]
@@ -149,7 +149,7 @@ def resense(model: Any, state: Any, record: Any, world: int, tick: int):
 
 @wp.func
 def rewind(model: Any, state: Any, record: Any, world: int):
-    """Go to the start in one world: initial estimates are those of the record, or drawn by the scenario."""
+    """Go to the start in one world: initial estimates are the record's, or drawn by the scenario."""
     if record.drawn != 0:
         state.seed[world] = record.key
         state.episode[world] = record.episode
@@ -362,7 +362,7 @@ def move_cosimulated(model: Any, state: Any, motion: Any, world: int, vehicle: i
 
 @wp.func
 def look_cosimulated(model: Any, state: Any, motion: Any, world: int, vehicle: int, tick: int):
-    """Do what a simulation does; the moving program may know of past contacts and departures."""
+    """Act as a simulation does; the moving program may know of past contacts and departures."""
     if state.ended[world, vehicle] == UNDER_WAY:
         if motion.crashed[world, vehicle] != 0 and model.scene.end_on_collision == 1:
             state.ended[world, vehicle] = COLLIDED

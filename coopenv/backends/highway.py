@@ -68,7 +68,7 @@ def make_environment(scenario: Scenario) -> Any:
     config = _config(scenario, scenario.highway, creator.default_config())
     try:
         return creator(config=config)
-    except Exception as error:  # whatever highway-env makes of it
+    except Exception as error:  # any error of highway-env
         raise ScenarioError(f"highway: {scenario.highway.id} cannot be made: {error_text(error)}") from None
 
 
@@ -77,7 +77,7 @@ LIMITS = {"max_acceleration", "max_speed", "max_steering", "reverse"}
 
 
 def _unknown_to_it(s: Scenario) -> Iterator[str]:
-    """Yield what of a scenario highway-env cannot do."""
+    """Yield the features of a scenario that highway-env lacks."""
     given = {"dynamics": s.dynamics, **{f"vehicles.{i}.dynamics": v.dynamics for i, v in enumerate(s.vehicles)}}
     for where, part in given.items():
         for name in sorted(_changed(part) - LIMITS):
@@ -241,12 +241,12 @@ class Simulation(TrafficProgram):
     def _call(self, method: str, *arguments: Any, **options: Any) -> None:
         try:
             getattr(self.environment, method)(*arguments, **options)
-        except Exception as error:  # whatever goes wrong in there
+        except Exception as error:  # any error of the program
             raise CoopenvError(f"highway-env: {method}: {error_text(error)}") from error
 
 
 def poses_of(cars: Sequence[Any], road: Any, origin: Array) -> Poses:
-    """Return where some cars of a road are, and everything else on it, in a map whose origin is at `origin` (3,)."""
+    """Return the poses of some cars of a road, and of all else on it, in a map with its origin at `origin` (3,)."""
     here, own = {id(car) for car in road.vehicles}, {id(car) for car in cars}
     others = [car for car in road.vehicles if id(car) not in own] + [thing for thing in road.objects if thing.solid]
     position = np.array([(*flipped(car.position), HEIGHT / 2) for car in others]).reshape(-1, 3)

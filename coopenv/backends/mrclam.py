@@ -28,7 +28,7 @@ __all__ = ["VARIANTS", "Dataset", "Variant", "load_dataset", "recording_of"]
 Variant = Literal["landmarks", "landmarks+robots", "blind"]
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
 BLIND_ROBOTS = (3, 4, 5)
-# What follows was tuned on sub-dataset 6 (docs/data.md); for observers in space on its first 300 s.
+# The next constants were tuned on sub-dataset 6 (docs/data.md); for observers in space on its first 300 s.
 TICK_S = 0.05
 MESSAGE_PERIOD_TICKS = 2  # 10 Hz, as V2X radios send
 NOISE = SensorNoise(velocity=0.15, angular_velocity=0.3, odometry_period=TICK_S, bearing=0.03)
@@ -146,7 +146,7 @@ def _setups(subjects: list[int], in_space: bool) -> tuple[Setup, ...]:
 
 
 def _response(turn: Array, step: Array) -> tuple[Array, Array]:
-    """Return by what the wheels turned the robot (K,) rad, and its path (K,) m, from the commanded turns and steps.
+    """Return the turns (K,) rad and paths (K,) m of the robot by its wheels, from the commanded turns and steps.
 
     The response is that of `planar_robust` before it has calibrated anything.
     """

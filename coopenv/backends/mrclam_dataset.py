@@ -195,7 +195,7 @@ class Robot:
     subject: int  # 1..5
     odometry: Array  # (N, 3): s since the time origin, commanded m/s forward, commanded rad/s
     detections: Array
-    """(n, 4): s since the time origin, who was seen (1..20), range m, bearing rad, counter-clockwise from the heading;
+    """(n, 4): s since the time origin, subject (1..20), range m, bearing rad, counter-clockwise from the heading;
     those of one time are one camera frame."""
     truth: MotionCapture  # for judging, and for starting where an observer is given its start
     skipped: int  # detections left out because no robot carries their barcode (misread by the camera)
@@ -240,7 +240,7 @@ def load_dataset(name: str, data: str | Path | None = None) -> Dataset:
 
 
 def _remarks_on(dataset: Dataset, tables: list[Rows]) -> list[str]:
-    """Return which robots saw nothing, and what of the files was left out or put in order."""
+    """Return notes on robots without detections, and on parts of the files left out or put in order."""
     skipped, outside = (sum(getattr(robot, name) for robot in dataset.robots) for name in ("skipped", "outside"))
     total = skipped + outside + sum(len(robot.detections) for robot in dataset.robots)
     blind = [str(robot.subject) for robot in dataset.robots if not len(robot.detections)]

@@ -44,7 +44,7 @@ class SourceKind(Enum):
 
 
 def kind_of(name: ScenarioLike) -> SourceKind:
-    """Return what a name stands for, whether or not it exists."""
+    """Return the kind of source of a name, which need not exist."""
     if is_bag(name):
         return SourceKind.BAG
     if str(name).endswith(LOG_SUFFIX):
@@ -73,7 +73,7 @@ def is_bag(name: ScenarioLike, topics: str | Path | None = None) -> TypeGuard[st
         return False
     try:
         return (Path(name) / "metadata.yaml").is_file() or (topics is not None and Path(name).is_dir())
-    except (OSError, ValueError):  # what can be no path
+    except (OSError, ValueError):  # no valid path
         return False
 
 
@@ -149,11 +149,11 @@ def open_backend(
     cars: Mapping[str, Any] | None = None,
     topics: str | Path | None = None,
 ) -> Backend:
-    """Return where the ticks of an environment or a recording come from.
+    """Return the source of ticks of an environment or a recording.
 
     Args:
-        name_or_path: what `load_scenario` takes, or MCAP file, ROS bag or data set.
-        backend: one of `BACKENDS`; None: by the name; a backend itself is returned as it is.
+        name_or_path: an environment as for `load_scenario`, or MCAP file, ROS bag or data set.
+        backend: one of `BACKENDS`; None: by the name; a backend itself is returned unchanged.
         overrides: dotted scenario keys.
         data: folder of the data sets.
         variant: of a data set.

@@ -121,7 +121,7 @@ class SumoProgram(TrafficProgram):
         """Let SUMO drive a vehicle along its route from the next tick on, from the nearest lane of the route.
 
         Raises:
-            CoopenvError: there is none of that name, or SUMO has it no more.
+            CoopenvError: there is none of that name, or it is no longer in SUMO.
         """
         i = self._index(vehicle)
         if np.isnan(self._last[i, 0]):
@@ -161,7 +161,7 @@ class SumoProgram(TrafficProgram):
         self._ask({"do": "step", "moved": rows})
 
     def poses(self) -> Poses:
-        """Return where everything is, see `TrafficProgram`."""
+        """Return all poses, see `TrafficProgram`."""
         own, others = self._answer()
         left = np.isnan(own[:, 0])
         self._last = own

@@ -116,7 +116,7 @@ def main() -> None:
     """Answer requests until the input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the program that has started it ends it
     replies = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what SUMO prints
+    os.dup2(2, 1)  # SUMO's output
     traffic = None
     for line in sys.stdin.buffer:
         try:

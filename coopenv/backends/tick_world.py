@@ -242,7 +242,7 @@ class TickWorld(SensingWorld):
 
 
 def _nothing(observer_init: ObserverInit) -> Sensed:
-    """Return what there is before the first tick: no motion, nothing in view."""
+    """Return the measurements before the first tick: no motion, nothing in view."""
     N, T = len(observer_init.setups), len(observer_init.setups[0].target_names)
     return Sensed(
         index=-1,

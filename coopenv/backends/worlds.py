@@ -23,7 +23,7 @@ from coopenv.world.embedded import HOST
 
 
 class SimulatedWorld(SensingWorld):
-    """A world that reads what vehicles sense from its state: copies in float64, bearings in the body frame."""
+    """A world that reads measurements from its state: copies in float64, bearings in the body frame."""
 
     @cached_property
     def _markers(self) -> np.ndarray:
@@ -37,7 +37,7 @@ class SimulatedWorld(SensingWorld):
         return to_body.swapaxes(-1, -2)
 
     def sensed(self, world: int, k: int) -> Sensed:
-        """Return what the vehicles of one world sense now, at tick k."""
+        """Return the measurements of the vehicles of one world now, at tick k."""
         L, rates = len(self._markers), self.scenario.rates
         visible = self._copy("sight", world) == Sight.VISIBLE
         bearings = np.where(visible[..., None], self._pointed("bearing", world) @ self._from_body, np.nan)
@@ -242,7 +242,7 @@ class ReplayWorld(SensingWorld):
         return self._recording.observer_init
 
     def sensed(self, world: int, k: int) -> Sensed:
-        """Return what was sensed at tick k, the same in every world and in float64 whatever the precision."""
+        """Return the measurements at tick k, the same in every world and in float64 for any precision."""
         return self._recording.at(k)
 
     def _build_model(self) -> Any:

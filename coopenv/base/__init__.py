@@ -30,7 +30,7 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
         return value
 
     def hint(name: str) -> str:
-        """Return where an unknown public name is: in a package below this one, in the shell, or one that is near."""
+        """Return a hint for an unknown public name: a package below this one, the shell, or a similar name."""
         if name.startswith("_"):
             return ""
         for file in Path(str(module.__file__)).parent.glob("*/__init__.py"):

@@ -78,7 +78,7 @@ def _cell(value: Any) -> Any:
 
 
 class Tabular(Explained, ABC):
-    """A result that other programs take as a table. Options of the methods are those of `columns`.
+    """A result that other programs take as a table. The methods have the options of `columns`.
 
     Units of numbers stand in the names of columns (`position_rmse_m`) and in the attributes of pandas and xarray:
     `frame.attrs["units"]`, `dataset["position_rmse_m"].attrs["units"]`.
@@ -162,7 +162,7 @@ WIDTH = 110
 
 
 def one_line(kind: object, title: str, facts: Mapping[str, object]) -> str:
-    """Return what `repr` prints of an object: `Kind('title', fact=value, ...)`."""
+    """Return the `repr` of an object: `Kind('title', fact=value, ...)`."""
     return f"{type(kind).__name__}({', '.join([repr(title), *(f'{key}={shown(facts[key])}' for key in facts)])})"
 
 
@@ -173,7 +173,7 @@ def facts_html(title: str, facts: Mapping[str, object]) -> str:
 
 
 def terminal_html(printable: Any) -> str:
-    """Return what rich prints of an object, its alignment kept."""
+    """Return rich's output of an object, its alignment kept."""
     from coopenv.base.terminal import Terminal
 
     console = Terminal(file=StringIO(), record=True, width=WIDTH)

@@ -53,7 +53,7 @@ class OutputError(CoopenvError):
 
 
 class DataError(CoopenvError):
-    """A recorded file is not what it claims to be."""
+    """A recorded file is damaged or of another kind."""
 
 
 class ScenarioWarning(UserWarning):
@@ -61,11 +61,11 @@ class ScenarioWarning(UserWarning):
 
 
 class AgentWarning(UserWarning):
-    """A learned agent observes what it has never seen in training."""
+    """A learned agent observes values beyond those of its training."""
 
 
 class DataWarning(UserWarning):
-    """A recorded or deployment file is what it claims to be, but lacks something that it should hold."""
+    """A recorded or deployment file is of the right kind, but lacks a required part."""
 
 
 def checked_seed(seed: object, what: str = "seed") -> int:
@@ -184,7 +184,7 @@ ELSEWHERE = {
     "to_json": "model_dump_json",
     "n_envs": "num_worlds",
 }
-"""Words of other libraries and of the shell, and those for the same here."""
+"""Words of other libraries and of the shell, and their equivalents here."""
 
 
 def suggest(word: str, valid: Iterable[str]) -> str:
@@ -196,7 +196,7 @@ def suggest(word: str, valid: Iterable[str]) -> str:
 
 
 class Explained:
-    """Has an error that lists what there is where an attribute is missing."""
+    """Raises an error that lists the attributes if one is missing."""
 
     if not TYPE_CHECKING:  # which knows the attributes
 

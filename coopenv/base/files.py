@@ -65,7 +65,7 @@ def put_in_place(part: Path, place: Path, names: Collection[str]) -> None:
 
 def exchange(part: Path, place: Path, old: Path) -> None:
     """Let `part` and the folder at `place` change places; the latter is then called `old`."""
-    part.rename(old)  # what is left of it if this process is killed goes entry by entry
+    part.rename(old)  # if this process is killed, the rest is removed entry by entry
     rename = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
     paths = os.fsencode(old), os.fsencode(place)
     if rename is not None and rename(AT_FDCWD, paths[0], AT_FDCWD, paths[1], RENAME_EXCHANGE) == 0:
@@ -209,7 +209,7 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
 
 @contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:
-    """Make a folder and those above it, where need be; after an error in the block, empty ones are removed again.
+    """Make a folder and its parents, where need be; after an error in the block, empty ones are removed again.
 
     Raises:
         OutputError: it cannot be made.
@@ -227,7 +227,7 @@ def new_folder(folder: Path) -> Iterator[Path]:
 
 
 def check_new(path: Path, force: bool, named: Path | None = None) -> None:
-    """Keep what is there, which errors call `named`. Raises OutputError: there is a file, and `force` is not given."""
+    """Keep an existing file, which errors call `named`. Raises OutputError: it exists, and `force` is not given."""
     if path.exists() and not force:
         raise OutputError(f"{named or path}: exists already; --force replaces it")
 

@@ -135,7 +135,7 @@ ONE_THREAD: Mapping[str, str] = dict.fromkeys(
 
 
 def available_cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -163,7 +163,7 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 @contextmanager
 def needing(words: str) -> Iterator[None]:
-    """Turn the absence of a package into a `CoopenvError`, whose words say what needs it, and how to install it."""
+    """Turn the absence of a package into a `CoopenvError` that names the feature and the command of installation."""
     try:
         yield
     except ImportError as error:

@@ -125,8 +125,8 @@ class Contest:
         Args:
             environment: as for `load_scenario`.
             overrides: dotted keys of the scenario.
-            agents: what `find_agent` takes; none: every shipped driver that was made for the environment.
-            worlds: how many.
+            agents: agents as for `find_agent`; none: every shipped driver that was made for the environment.
+            worlds: number of worlds.
             block: number of the block of held-out seeds.
             ideal: let the baseline drive under ideal sensing, too.
             stressed: let the drivers drive in the worlds of `stress`, too.
@@ -408,7 +408,7 @@ def carded(contest: Contest) -> list[tuple[Entrant, Path]]:
 
 
 def read(folder: Path) -> dict[str, Any]:
-    """Return what `card.json` holds, results by environment under `environments`; nothing of them without a card.
+    """Return the contents of `card.json`, results by environment under `environments`; without a card, no results.
 
     Raises:
         CoopenvError: `card.json` is not one.
@@ -424,7 +424,7 @@ def read(folder: Path) -> dict[str, Any]:
 
 
 def write(evaluation: Evaluation, cards: Iterable[tuple[Entrant, Path]], command: str) -> list[Path]:
-    """Write the results of an evaluation to cards, see `carded`; those of other environments stay."""
+    """Write the results of an evaluation to cards, see `carded`; results of other environments stay."""
     written = []
     for entrant, folder in cards:
         card = read(folder)
@@ -460,7 +460,7 @@ def seeds_of(card: Mapping[str, Any], metric: str) -> list[float]:
 
 
 def medians(card: Mapping[str, Any], base: Mapping[str, Any]) -> str:
-    """Return by how much the errors of the median seed of a study differ from those of another's, in words."""
+    """Return the difference between the errors of the median seeds of two studies, in words."""
     shares = {m: median(seeds_of(card, m)) / median(seeds_of(base, m)) - 1 for m in ("e50_m", "e95_m")}
     return ", ".join(f"{CHANGES[metric]} {100 * share:+.0f} %" for metric, share in shares.items())
 

@@ -78,14 +78,14 @@ def run(
     """Evaluate, with progress shown, and write the files.
 
     Args:
-        contest: what is evaluated.
+        contest: the evaluation.
         command: the command line that gives the same figures again.
         log: console of the progress.
         out: folder of the files, which is replaced as a whole; None: no files.
         figures: their format; None: no figures and no replay.
         width: column of `coopenv.viz.figures` that figures are drawn for; None: a page's.
-        film: whether a film is written.
-        force: whether an earlier evaluation in the folder is replaced.
+        film: write a film.
+        force: replace an earlier evaluation in the folder.
 
     Raises:
         OutputError: the folder holds an earlier evaluation that is not to be replaced, or it cannot be written.
@@ -131,7 +131,7 @@ def evaluate(
         environment: name, TOML file, dict or scenario, as for `coopenv.load_scenario`.
         agents: one or several names, folders, import paths (`mine.py:Mine`), classes or functions; none: every shipped
             agent made for the environment.
-        worlds: how many.
+        worlds: number of worlds.
         overrides: dotted scenario keys.
         seed_block: number of the block of held-out seeds.
         ideal: let `route_follower` drive under ideal sensing, too.

@@ -189,7 +189,7 @@ class Pool:
             idle[0].pipe.send((task, len(self.results[number]), ended))
 
     def _look(self) -> bool:
-        """Take what the workers send, and end those above a limit; return whether a task is finished."""
+        """Receive the workers' results, and end workers above a limit; return whether a task is finished."""
         finished, ready = False, wait([worker.pipe for worker in self._busy], POLL)
         for worker in self._busy:
             if worker.pipe in ready:

@@ -235,7 +235,7 @@ def _limited(value: float | None) -> float:
 
 
 def report(benchmark: Frozen, result: Mapping[str, Any]) -> Iterator[Table | str]:
-    """Yield the totals and the errors by scene, those of the zoo included, failures, and remarks."""
+    """Yield the totals and the errors by scene, with the zoo's, failures, and remarks."""
     own = {row["observer"] for row in result["rows"]}
     zoo = [row for row in benchmark.zoo["rows"] if row["scene"] in result["scenes"] and row["observer"] not in own]
     numbers = ["RMSE\n[m]", "median\nvehicle", "worst\nvehicle", "above\n5 m", "failed", "\nANEES", "worst\nANEES"]

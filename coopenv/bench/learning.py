@@ -1,4 +1,4 @@
-"""`coopenv bench learning`: train what a study lacks, side by side, and write a card as each run ends."""
+"""`coopenv bench learning`: run the missing trainings of a study, side by side, and write a card after each."""
 
 import json
 import tomllib
@@ -43,12 +43,12 @@ class StudyFile(Section):
 
 
 def agent_of(plan: TrainingPlan) -> str:
-    """Return the name of the agent that comes of all trainings which differ in nothing but their seed."""
+    """Return the name of the agent of all trainings that differ in their seed alone."""
     return f"{plan.environment}_{plan.arm}"
 
 
 def place_of(plan: TrainingPlan) -> Path:
-    """Return where the agent of a training goes, in the study's folder."""
+    """Return the path of a training's agent in the study's folder."""
     return Path(agent_of(plan), f"seed_{plan.seed}")
 
 
@@ -116,7 +116,7 @@ def unfinished(study: Study, folder: Path) -> list[TrainingPlan]:
     """Return the trainings of a study that are not finished.
 
     Raises:
-        CoopenvError: one of them is not possible: better now than when the others have been waited for.
+        CoopenvError: one of them is not possible; it is found before the others run.
     """
     from coopenv.training.command import possible  # needs the extra `train`
 
@@ -135,7 +135,7 @@ def perform(folder: Path, logs: Path, plan: TrainingPlan) -> None:
     An agent that is there has been trained with other settings, and is replaced.
 
     Raises:
-        CoopenvError: what `train` raises.
+        CoopenvError: errors of `train`.
     """
     from coopenv.training.command import read, train  # needs the extra `train`
 
@@ -165,7 +165,7 @@ class Driven(NamedTuple):
 
 
 class Judge:
-    """Drives agents in the same worlds, and remembers what came of it: figures, and one environment's episodes."""
+    """Drives agents in the same worlds, and stores the results: figures, and one environment's episodes."""
 
     def __init__(self, worlds: int) -> None:
         """Take so many worlds of either block."""
@@ -181,7 +181,7 @@ class Judge:
         return self._score(_driven(environment, agent, overrides or {}, block))
 
     def against(self, environment: str, agent: str | Path, other: str | Path) -> list[Difference]:
-        """Return how much an agent's figures differ from another's in the same worlds."""
+        """Return the differences between two agents' figures in the same worlds."""
         return self._compare(*(_driven(environment, each, {}, REPORTED) for each in (agent, other)))
 
     def merit(self, environment: str, agent: Path, overrides: Mapping[str, Any]) -> float:
@@ -298,12 +298,12 @@ def run(study: Study, part: Study, folder: Path, logs: Path, jobs: int, worlds: 
 
     Args:
         study: the trainings that cards compare.
-        part: what is to be trained now.
+        part: the trainings to run now.
         folder: for the agents.
         logs: for TensorBoard's files.
         jobs: trainings side by side, of one core each.
         worlds: held-out ones per agent.
-        log: where progress is shown.
+        log: console of the progress.
 
     Raises:
         CoopenvError: a training cannot be done.

@@ -38,7 +38,7 @@ _IDLE = "zero"  # the driver of a scene without a route
 
 
 def films(name: str, scenario: Scenario, folder: Path) -> Iterator[str]:
-    """Yield the films in a folder and what they show."""
+    """Yield the films in a folder and their contents."""
     views = {"from above": folder / f"{name}.webp", "in 3-D": space_path(name, folder)}
     shown = [f"![Film of {name}, {view}]({path.name})" for view, path in views.items() if path.is_file()]
     if shown:
@@ -155,15 +155,15 @@ def contests(environment: str, scenario: Scenario, worlds: int) -> dict[str, Con
 def write_figures(
     environment: str, scenario: Scenario, folder: Path, worlds: int, on_progress: Callable[[float, str], None]
 ) -> None:
-    """Measure what sensing, or cooperation, is worth in an environment, and write it for the page.
+    """Measure the value of sensing, or cooperation, in an environment, and write it for the page.
 
     Both drivers drive in the same held-out worlds at every setting.
 
     Args:
         environment: name or TOML file.
-        scenario: what it is now.
+        scenario: the present scenario.
         folder: of the page.
-        worlds: how many.
+        worlds: number of worlds.
         on_progress: called with the share that is done, and the driver.
     """
     rows: list[dict[str, Any]] = []
@@ -180,7 +180,7 @@ def write_figures(
 
 
 def read_value_of_sensing(path: Path) -> dict[str, Any] | None:
-    """Return what was measured earlier; None where nothing was.
+    """Return the earlier measurement; None without one.
 
     Raises:
         CoopenvError: the file holds something else.
@@ -263,7 +263,7 @@ def write_page(name: str, scenario: Scenario, folder: Path, on_film: Callable[[f
 
     Args:
         name: of the environment.
-        scenario: what it is.
+        scenario: its scenario.
         folder: which `prepare` has made.
         on_film: called with the share of its film that is done (None: no film is made, one that is there stays).
 

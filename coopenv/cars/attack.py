@@ -1,4 +1,4 @@
-"""`coopenv svea attack`: what a program without a key can send to standing cars, and whether it moves them."""
+"""`coopenv svea attack`: messages of a program without a key to standing cars, and their effect."""
 
 import math
 import random
@@ -38,7 +38,7 @@ PORTS = {
     9090: "rosbridge",
     11311: "ROS 1",
 }
-"""TCP ports of a car that should be closed, and what may listen there."""
+"""TCP ports of a car that should be closed, and their usual programs."""
 
 Send = Callable[[str, int], Any]
 """Sends a message of a kind to a car, or makes its payload, by the message's number."""
@@ -130,7 +130,7 @@ class Intruder:
     def _under(
         self, *names: str, payload: Send | None = None, signer: Sign | None = None, mode: str = "client"
     ) -> Send:
-        """Return what puts a payload, or a command that drives, under one key after the other.
+        """Return the function that puts a payload, or a driving command, under one key after the other.
 
         `{car}` and the topics of the car by role, such as `{manual}`, are filled in.
         """
@@ -187,7 +187,7 @@ class Intruder:
         return self._random.choice((b"", ENCAPSULATION)) + self._random.randbytes(self._random.randrange(least, most))
 
     def kinds(self) -> Mapping[str, Send]:
-        """Return what sends a message of each kind."""
+        """Return the senders of a message of each kind."""
 
         def armed_or_driven(car: str, i: int) -> bytes:
             return self._command(car, i) if i % 2 else self._arm(car)
@@ -272,7 +272,7 @@ class AttackOutcome:
 
 
 def attack(intruder: Intruder, commands: int) -> Iterator[AttackOutcome]:
-    """Attack standing cars with messages of each kind, and yield what each did; a kind that succeeds is ended.
+    """Attack standing cars with messages of each kind, and yield each outcome; a kind that succeeds is ended.
 
     Args:
         intruder: sends.

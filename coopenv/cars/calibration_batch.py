@@ -76,7 +76,7 @@ FRAME = (
     *(Kind(f"truth.frame_{axis}", "m", 0.3, 1e-6, "frame of motion capture") for axis in "xy"),
 )
 BENT = {"k1": 0.5, "k2": 0.5, "p1": 0.02, "p2": 0.02}
-"""Priors of coefficients; those of others are 0.2."""
+"""Priors of coefficients; 0.2 for all others."""
 ROT, LEVER, LENS, SCALE, BIAS = slice(0, 3), slice(3, 6), slice(6, 18), 18, 19
 CAMERA_TIME, WHEEL_TIME, TRUTH_TIME, BODY = 20, 21, 22, slice(23, 26)
 NUISANCE = (SCALE, BIAS)
@@ -178,16 +178,16 @@ class Batch:
         self.paths: dict[int, tuple[tuple[float, ...], Path]] = {}  # the last one of each car, with its constants
 
     def own(self, c: int) -> slice:
-        """Return where the constants of a car are."""
+        """Return the slice of the constants of a car."""
         return slice(c * len(PER_CAR), (c + 1) * len(PER_CAR))
 
     def lens(self, c: int) -> NDArray[np.int64]:
-        """Return where the constants of the lens of a car are."""
+        """Return the slice of the constants of a car's lens."""
         lens, begin = self.cars[c].lens, self.own(c).start + LENS.start
         return np.arange(begin, begin + 4 + (0 if lens is None else len(lens.distortion)))
 
     def marker(self, i: int) -> slice:
-        """Return where the coordinates of a marker are."""
+        """Return the slice of the coordinates of a marker."""
         return slice(self.markers + 3 * i, self.markers + 3 * i + 3)
 
     def path(self, c: int, x: Array) -> Path:
@@ -209,7 +209,7 @@ class Batch:
         return self.paths[c][1]
 
     def residuals(self, c: int, x: Array, pose: Array, near: Array | None = None) -> tuple[Array, Array, Array]:
-        """Return those of sightings (n, 2), odometry (M - 1, 3) and motion capture (T, 3), px or rad, m, rad.
+        """Return the residuals of sightings (n, 2), odometry (M - 1, 3) and motion capture (T, 3), px or rad, m, rad.
 
         `near`: constants by whose offsets keyframes are assigned, and from which offsets act (None: x).
         """
@@ -345,7 +345,7 @@ class Batch:
         return System(S, g, np.concatenate(scores), back)
 
     def times(self, c: int) -> Array:
-        """Return when the rows of a car's residuals are, s."""
+        """Return the times (s) of the rows of a car's residuals."""
         car = self.cars[c]
         return np.concatenate([np.repeat(car.time, 2), np.repeat(self.keys[c][:-1], 3), np.repeat(car.truth_time, 3)])
 
@@ -374,7 +374,7 @@ class Batch:
         return fit
 
     def begin(self) -> Fit:
-        """Return where fits start: motion capture, or without it what windows of sightings give."""
+        """Return the start of fits: motion capture, or without it solutions of windows of sightings."""
         x, poses = np.zeros(len(self.kinds)), []
         for c, car in enumerate(self.cars):
             if self.truth[c]:
@@ -389,7 +389,7 @@ class Batch:
         return Fit(x, tuple(poses), self.scales(x, poses), free)
 
     def misfit(self, labels: NDArray[np.int64]) -> float:
-        """Return how badly sightings fit, (2 sin(angle / 2))^2 up to 0.04, if markers stand at others' places.
+        """Return the misfit of sightings, (2 sin(angle / 2))^2 up to 0.04, if markers are exchanged.
 
         Motion capture counts at the offset of its stamps at which they fit best.
         """
@@ -471,7 +471,7 @@ def by_stretch(time: Array, J: Array, r: Array) -> Array:
 
 
 def standard_errors(S: Array, scores: Array, prior: Array) -> Array:
-    """Return those by an information and the scores (stretches, G); `prior`: (G,) standard deviations."""
+    """Return standard errors by an information and the scores (stretches, G); `prior`: (G,) standard deviations."""
     inverse = np.linalg.inv(S)
     robust = inverse @ (scores.T @ scores + np.diag(prior**-2)) @ inverse
     return np.asarray(np.sqrt(np.maximum(robust.diagonal(), inverse.diagonal())))

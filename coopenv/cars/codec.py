@@ -77,7 +77,7 @@ def _type(kind: str) -> tuple[Any, dict[str, Any], list[tuple[str, Callable[[Any
 
 
 def _field(node: Any) -> Callable[[Any], Any]:
-    """Return what makes a message or a list within a message; `node` is the field as rosbags describes it."""
+    """Return the constructor of a message or a list within a message; `node` is the field as rosbags describes it."""
     kind, of = node
     if kind.name == "NAME":
         names = [name for name, _ in ros2().fielddefs[of][1]]
@@ -140,7 +140,7 @@ def _decoded(read: Any, payload: bytes, kind: str) -> Any:
         raise CoopenvError(f"{kind}: {len(payload)} bytes are over {most}")
     try:
         return read(payload, kind)
-    except Exception as error:  # whatever the library raises at bytes that make no sense
+    except Exception as error:  # any error of the library at malformed bytes
         raise CoopenvError(f"{kind}: cannot be read ({type(error).__name__})") from None
 
 

@@ -1,4 +1,4 @@
-"""The deployment file: which cars there are, how they are reached, and what they may do."""
+"""The deployment file: the cars, their network, and their limits."""
 
 import json
 from collections import Counter
@@ -259,7 +259,7 @@ class Safety(Section):
     """Largest offset between the clocks of a car and of this computer for arming, s."""
 
     def stopping(self, speed: float, command: CommandMessage) -> dict[str, tuple[float, float]]:
-        """Return by cause after which time, s, and way, m, a car at a speed, m/s, stands.
+        """Return by cause the time, s, and the distance, m, in which a car at a speed, m/s, stops.
 
         The gate sends neutral, or brakes; without it the autopilot lets the car roll.
         """
@@ -297,8 +297,8 @@ class Deployment(Section):
     overrides: dict[str, Any] = Field(default={})
     """Dotted keys of the environment with other values."""
     profile: CarProfile = SVEA
-    """Make of the cars: a shipped profile, `svea`; a TOML file (relative to this file); or a table of what differs from
-    the profile `base`."""
+    """Make of the cars: a shipped profile, `svea`; a TOML file (relative to this file); or a table of differences
+    from the profile `base`."""
     cars: tuple[Car, ...] = Field(min_length=1, max_length=64)
     """One table `[[cars]]` per car."""
     markers: dict[str, Marker] = Field(default={})

@@ -194,10 +194,10 @@ def prepare_gate(
     keys: Path | None = None,
     limits: Mapping[str, Any] | None = None,
 ) -> Callable[[Transport, GateClock], GateConnection]:
-    """Return what connects the gate of a car to a network: all that can be wrong without one.
+    """Return the function that connects a car's gate to a network, checked as far as possible without one.
 
     Args:
-        fleet: that the car belongs to.
+        fleet: the fleet of the car.
         car: its name.
         station: identity that may arm and command (None: the fleet's).
         keys: folder of keys (None: the fleet's; without any nothing is signed, and any station can drive the car).

@@ -90,7 +90,7 @@ def _given(limits: Any, name: str) -> float:
 
 
 def _level(name: str, unit: str, given: float, measure: Callable[[Array], float], values: Array) -> ConstantRow:
-    """Return what is measured of values, with the standard error by parts of the drive."""
+    """Return the estimate of values, with the standard error by parts of the drive."""
     parts = [measure(part) for part in np.array_split(values, PARTS)]
     return ConstantRow(name, unit, given, measure(values), float(np.std(parts, ddof=1)) / np.sqrt(PARTS), "")
 
@@ -160,7 +160,7 @@ def _sightings(sent: Sent) -> tuple[Array, Array]:
 
 
 def _quantities(sent: Sent) -> Iterator[tuple[str, Array]]:
-    """Yield the values of what is compared."""
+    """Yield the compared values."""
     for role, name, axis in ((Role.WHEEL, "linear", 0), (Role.IMU, "angular", 2)):
         samples = [s for s in sent.get(role, ()) if getattr(s.value, name) is not None]
         value = np.array([getattr(s.value, name)[axis] for s in samples])

@@ -92,7 +92,7 @@ def check_identity(name: str, what: str) -> None:
 
 
 def _signed(name: bytes, topic: str, payload: bytes) -> bytes:
-    """Return what is signed; the lengths stand before the parts, so that none can pass for another."""
+    """Return the signed bytes; the lengths precede the parts, so that no part can pass for another."""
     place = topic.encode()
     return DOMAIN + struct.pack("<BIQ", len(name), len(place), len(payload)) + name + place + payload
 
@@ -105,7 +105,7 @@ OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 class KeyFileError(CoopenvError):
-    """A file of keys is not there, not safe, or not what it must be."""
+    """A file of keys is missing, not safe, or malformed."""
 
 
 def make_keys(folder: str | Path, identities: Iterable[str], force: bool = False) -> tuple[list[str], list[str]]:
@@ -142,12 +142,12 @@ def make_keys(folder: str | Path, identities: Iterable[str], force: bool = False
             new.append(name)
     replace_text(folder / PUBLIC, HEAD + "".join(f'{name} = "{text}"\n' for name, text in sorted(public.items())))
     with writing(folder):
-        (folder / PUBLIC).chmod(0o644)  # whatever the umask
+        (folder / PUBLIC).chmod(0o644)  # regardless of the umask
     return new, kept
 
 
 def load_signer(path: str | Path, identity: str) -> Signer:
-    """Return what signs as an identity.
+    """Return the signer of an identity.
 
     Args:
         path: its private file, or a folder of keys.
@@ -172,7 +172,7 @@ def load_signer(path: str | Path, identity: str) -> Signer:
 
 
 def load_verifier(path: str | Path) -> Verifier:
-    """Return what knows the public keys of a file `public.toml`, or of the folder with it; errors as `load_signer`."""
+    """Return the verifier with the public keys of a file `public.toml`, or of its folder; errors as `load_signer`."""
     path = Path(path)
     path = path / PUBLIC if path.is_dir() else path
     ed25519 = library()
@@ -188,7 +188,7 @@ def load_verifier(path: str | Path) -> Verifier:
 def load_keys(
     folder: Path | None, identity: str, senders: Iterable[str]
 ) -> tuple[Signer, Verifier] | tuple[None, None]:
-    """Return what signs as an identity, and what knows the keys of some senders; without a folder neither.
+    """Return the signer of an identity, and the verifier of some senders; without a folder neither.
 
     Raises:
         KeyFileError: a sender's key is missing; others as for `load_signer`.
@@ -264,7 +264,7 @@ def _read_public(path: Path) -> dict[str, str]:
 
 
 def _read(path: Path, forbidden: int, danger: str, remedy: str) -> bytes:
-    """Return what a plain file of this user holds, unless its mode allows others what is forbidden."""
+    """Return the contents of a plain file of this user, unless its mode permits too much to other users."""
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))  # a pipe would keep us waiting
     except OSError as error:

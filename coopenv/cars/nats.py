@@ -42,7 +42,7 @@ def subjects_of(pattern: str) -> tuple[str, ...]:
 
 
 def attachment_of(headers: dict[str, str] | None) -> bytes:
-    """Return what is beside a message; nothing, if its header is none of ours."""
+    """Return the attachment of a message; nothing, if its header is foreign."""
     try:
         return base64.b64decode((headers or {}).get(ATTACHMENT, ""), validate=True)
     except ValueError:
@@ -207,7 +207,7 @@ def open_nats(connect: Sequence[str], tls: Tls | None = None, timeout: float = 2
     last: list[Exception] = []
 
     async def keep(error: Exception) -> None:
-        """Keep the library from printing what it will try again."""
+        """Suppress the library's messages about attempts that it repeats."""
         last[:] = [error]
 
     context = tls.context() if tls else None

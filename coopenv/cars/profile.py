@@ -340,7 +340,7 @@ class VisionSettings(Section):
     """Hues, deg, from the first to the second (red 0, green 120, blue 240), by number of a marker. With any, blobs of
     these colours are found instead of tags."""
     exposure: float = Field(default=0.0, ge=0.0, le=1.0)
-    """Time of exposure, s: half of it is added to the stamps, which are those of its begin."""
+    """Time of exposure, s: half of it is added to the stamps, which mark its begin."""
     row_time: float = Field(default=0.0, ge=0.0, le=1e-3)
     """Time from a row to the next of a rolling shutter, s: that of the tags is added to the stamps, which are those of
     the first row."""

@@ -198,9 +198,9 @@ def read(
         role: of its topic.
         message: as rosbags decodes it.
         calibration: of the camera; needed for pixels, and for bearings that were made without removing distortion.
-        distorted: whether `bearings` were made so.
+        distorted: `bearings` were computed from distorted pixels.
         known: markers that there are; detections of others are dropped and counted (None: all count).
-        vision: what frames of a camera are of.
+        vision: markers in the frames of a camera.
 
     Raises:
         CoopenvError: one line that names the role and the field: a type that the role has not, a value that is not
@@ -298,7 +298,7 @@ READERS: dict[Role, dict[str, Callable[..., Value]]] = {
     Role.REMOTE: {"mavros_msgs/msg/RCIn": remote_of},
     Role.BATTERY: {"sensor_msgs/msg/BatteryState": battery_of},
 }
-"""Types of a role, and what reads them; the message to the wheels depends on the profile."""
+"""Types of a role, and their readers; the message to the wheels depends on the profile."""
 
 
 def check_types(profile: CarProfile, where: str) -> None:
@@ -319,7 +319,7 @@ TRACKS = (
 
 
 def tracks_of(samples: Sequence[Sample], start: int) -> dict[str, Any]:
-    """Return what wheels, gyro and motion capture measured, and commands, as arrays by the names of `TRACKS`.
+    """Return measurements of wheels, gyro and motion capture, and commands, as arrays by the names of `TRACKS`.
 
     Times are in s since a start, ns; velocities (m/s, body) and places (m, map) are complex numbers x + iy.
     """

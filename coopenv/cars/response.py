@@ -87,7 +87,7 @@ class Response:
         return time[inside], value[inside]
 
     def rows(self, x: Array, dead: Array) -> Array:
-        """Return what the model exceeds the measurements by (P, R), for constants (P, K) and dead bands (P,), m/s."""
+        """Return the residuals (P, R) of the model, for constants (P, K) and dead bands (P,), m/s."""
         grid, c = self._grid, dict(zip(NAMES, x.T, strict=True))
         edges = np.empty((len(x), len(grid) + len(self._when)))
         wanted = np.empty((len(x), edges.shape[1] - 1, 2))
@@ -155,7 +155,7 @@ class Constants(NamedTuple):
     error: Array  # (K,)
     beyond: Mask  # (K,) limits that the drive has not reached
     dead: tuple[float, float]  # bounds of the dead band, m/s
-    rest: list[Array]  # what is left of each series
+    rest: list[Array]  # residuals of each series
 
 
 class _Fit(NamedTuple):

@@ -97,7 +97,7 @@ class TopicRoute:
 
 
 def routes_of(car: Car, profile: CarProfile = SVEA) -> tuple[TopicRoute, ...]:
-    """Return those of a car. Raises DeploymentError: it has no number."""
+    """Return the routes of a car. Raises DeploymentError: it has no number."""
     agent = car.agent_number
     if agent is None:
         raise DeploymentError(f"cars: {car.name}: agent is missing: the N of agentN in the authors' names (or marker)")
@@ -119,7 +119,7 @@ class Authors:
     """
 
     def __init__(self, wire: Transport, routes: Iterable[TopicRoute]) -> None:
-        """Take a network with the authors' messages, which is closed with this, and what is translated."""
+        """Take a network with the authors' messages, which is closed with this, and the translated topics."""
         self._wire = wire
         self.announce, self.watch, self.close = wire.announce, wire.watch, wire.close
         self._routes = {route.topic: route for route in routes}
@@ -158,7 +158,7 @@ class Authors:
 
 
 def _translate(route: TopicRoute, callback: Callback, arrival: Arrival) -> None:
-    """Pass on what came under an authors' name; bytes of another type go no further."""
+    """Pass on messages of an authors' topic; bytes of another type are dropped."""
     try:
         payload = cdr_of(arrival.payload, route.theirs)
     except CoopenvError:
@@ -167,7 +167,7 @@ def _translate(route: TopicRoute, callback: Callback, arrival: Arrival) -> None:
 
 
 ENVELOPE = "std_msgs/msg/UInt8MultiArray"
-"""Type of topics that the authors do not have: CDR bytes, with what is beside them before them."""
+"""Type of topics that the authors do not have: CDR bytes after their attachment."""
 
 CALLER = "/coopenv"
 
@@ -341,7 +341,7 @@ class Ros1(HeartbeatTransport):
         return self._rospy.Subscriber(f"/{topic}", self._kind(topic), arrive, **options)
 
     def _discover(self) -> None:
-        """Subscribe to what is wanted: topics by name, and those of a pattern that are of the type expected of them."""
+        """Subscribe to topics by name, and to topics of a pattern with the expected type."""
         published: list[str] = []
         if any("*" in pattern for pattern, _ in self._wanted):
             with suppress(OSError):  # the master is away: those who know each other go on
@@ -379,7 +379,7 @@ class Ros1(HeartbeatTransport):
             self._subscribers.clear()
 
     def _end(self) -> None:
-        """Take back what this transport has published and subscribed; the node itself ends with the process."""
+        """Withdraw this transport's publications and subscriptions; the node itself ends with the process."""
         time.sleep(0.05)  # rospy sends in threads of its own
         self._closed.set()
         self._unregister()

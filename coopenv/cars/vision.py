@@ -85,7 +85,7 @@ Raises CoopenvError: it is malformed, or no extra."""
 
 
 def _blocks(message: Any, _settings: VisionSettings, camera: Calibration) -> list[Tag]:
-    """Return those of an ObjectInfoArrayStamped; without an area, or outside the image, they have no ray."""
+    """Return the detections of an ObjectInfoArrayStamped; without an area, or outside the image, they have no ray."""
     found, (width, height) = [], camera.image_size
     for block in message.objects:
         u, v, area = int(block.center_x), int(block.center_y), int(block.width) * int(block.height)
@@ -95,7 +95,7 @@ def _blocks(message: Any, _settings: VisionSettings, camera: Calibration) -> lis
 
 
 def _bearings(message: Any, _settings: VisionSettings, camera: Calibration | None) -> list[Tag]:
-    """Return those of an ObjectBearingArrayStamped, whose vectors point from the target to the camera.
+    """Return the detections of an ObjectBearingArrayStamped; its vectors point from the target to the camera.
 
     The authors' node keeps the order of its camera, largest block first. With a camera, distortion was not removed from
     the pixels of the vectors: then they give back the pixels. Those without length 1 have no ray.
@@ -131,7 +131,7 @@ def _frame(message: Any, settings: VisionSettings, camera: Calibration) -> list[
 
 
 def _apriltags(message: Any, _settings: VisionSettings, camera: Calibration) -> list[Tag]:
-    """Return those of an AprilTagDetectionArray; its centres are those of the projection."""
+    """Return the detections of an AprilTagDetectionArray; its centres are the projection's."""
     found = [
         (d.id, np.ptp([p.x for p in d.corners]) * np.ptp([p.y for p in d.corners]), d.centre.x, d.centre.y)
         for d in message.detections
@@ -140,7 +140,7 @@ def _apriltags(message: Any, _settings: VisionSettings, camera: Calibration) -> 
 
 
 def _boxes(message: Any, _settings: VisionSettings, camera: Calibration) -> list[Tag]:
-    """Return those of a Detection2DArray: the class of the best hypothesis is the number."""
+    """Return the detections of a Detection2DArray: the class of the best hypothesis is the number."""
     found = []
     for detection in message.detections:
         guesses: list[Any] = [getattr(result, "hypothesis", result) for result in detection.results]
@@ -156,14 +156,14 @@ def _boxes(message: Any, _settings: VisionSettings, camera: Calibration) -> list
 def _centred(found: list[tuple[int, float, float, float]], camera: Calibration) -> list[Tag]:
     """Return tags of number, size, and centre in pixels."""
     table = np.array(found, dtype=np.float64).reshape(-1, 4)
-    with np.errstate(all="ignore"):  # what is not finite is no ray
+    with np.errstate(all="ignore"):  # values that are not finite give no ray
         units, there = rays(table[:, 2:], camera)
     rows = zip(found, units, there, strict=True)
     return [Tag(int(n), size, ray if known else None, v if known else None) for (n, size, _, v), ray, known in rows]
 
 
 def _markers(message: Any, _settings: VisionSettings, _: Calibration) -> list[Tag]:
-    """Return those of the authors' ArucoArray, or of a MarkerArray: positions in the camera's optical frame."""
+    """Return the detections of the authors' ArucoArray, or a MarkerArray: positions in the camera's optical frame."""
     found = []
     entries: Any = message.arucos if hasattr(message, "arucos") else message.markers
     for entry in entries:
@@ -213,7 +213,7 @@ ENCODINGS = {
     "bayer_gbrg8": (1, "u1", "BayerGR2{}"),
     "bayer_grbg8": (1, "u1", "BayerGB2{}"),
 }
-"""Numbers per pixel, their type, and OpenCV's conversion to what is wanted."""
+"""Numbers per pixel, their type, and OpenCV's conversion."""
 
 
 def frame_of(message: Any, wanted: Literal["GRAY", "BGR"] = "GRAY") -> NDArray[np.uint8]:

@@ -150,7 +150,7 @@ def open_zenoh(
             "connect/exit_on_failure": bool(connect),
             "connect/retry": RETRY,
             "transport/link/tx/lease": LEASE,
-            # How long a reliable message may keep its sender waiting, us, before the link counts as broken.
+            # Longest wait of a sender for a reliable message, us, before the link counts as broken.
             "transport/link/tx/queue/congestion_control/block/wait_before_close": LEASE * 1000,
             **{f"transport/link/tls/{key}": value for key, value in (tls.for_zenoh() if tls else {}).items()},
         }
@@ -175,7 +175,7 @@ def _read_config(path: Path) -> Any:
 
 
 def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:
-    """Connect to the network of a fleet; topics are those of the profile on every kind of network.
+    """Connect to the network of a fleet; topics are the profile's on every kind of network.
 
     Args:
         deployment: the network and its certificates.

@@ -1,4 +1,4 @@
-"""Functions of a few small arrays, compiled by Numba: in NumPy every operation takes a microsecond, whatever its size.
+"""Functions of a few small arrays, compiled by Numba: in NumPy every operation takes a microsecond at any size.
 
 Each function is compiled for one type per argument, which admits any memory layout. Compilation happens when the module
 is first loaded on a machine, once: other processes wait for it. As in C, the shapes of the arguments are not checked.
@@ -40,7 +40,7 @@ ROW, TARGET = (types.Array(types.float64, n, "C") for n in (1, 2))
 NUMBER, WHOLE, FLAG = types.float64, types.int64, types.boolean
 
 PACKAGE = Path(__file__).parents[1]
-ROOMS = ("estimation", "observers")  # where compiled functions are, and what they use
+ROOMS = ("estimation", "observers")  # packages of compiled functions and of their parts
 LONGEST_COMPILATION = 120.0  # s of all functions; a process that holds the lock for longer is taken for suspended
 _BEGINNING = "compiled-"  # of the folders' names
 
@@ -68,7 +68,7 @@ def _made(function: Any, arguments: tuple[Any, ...], folder: Path | None) -> Any
         if folder is not None:
             config.CACHE_DIR = str(folder)
             held = None if _kept(function, folder) else lock(folder, LONGEST_COMPILATION)
-            with suppress(Exception):  # what is kept is damaged, or the disk is full; an error of the function returns
+            with suppress(Exception):  # the cache is damaged, or the disk is full; an error of the function returns
                 return compile_by(cache=True)(function)
         return compile_by()(function)
     finally:
@@ -84,7 +84,7 @@ def _kept(function: Any, folder: Path) -> bool:
 
 @cache
 def code_folder() -> Path | None:
-    """Return where machine code of these very sources is kept; None where there is no place to write to.
+    """Return the folder of the machine code of the present sources; None if no folder is writable.
 
     That is beside the package, else in the user's cache; in NUMBA_CACHE_DIR if that is set.
     """

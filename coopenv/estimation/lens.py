@@ -31,7 +31,7 @@ CLOSE = 1e-9
 
 
 def distort(points: Array, distortion: tuple[float, ...]) -> Array:
-    """Return where a lens images points; both (m, 2), normalised (at distance 1)."""
+    """Return the images of points by a lens; both (m, 2), normalised (at distance 1)."""
     x, y = points[:, 0], points[:, 1]
     r2 = x * x + y * y
     if len(distortion) == FISHEYE:
@@ -111,7 +111,7 @@ def _images(found: Array, points: Array, distortion: tuple[float, ...], reach: f
 
 
 def _newton(start: Array, points: Array, distortion: tuple[float, ...]) -> Array:
-    """Return where Newton's method comes to from a start; (m, 2) each."""
+    """Return the result of Newton's method from a start; (m, 2) each."""
     _, _, p1, p2 = distortion[:4]
     found = start.copy()
     with np.errstate(all="ignore"):  # where it does not converge
@@ -141,7 +141,7 @@ def _radially(points: Array, distortion: tuple[float, ...], reach: float) -> Arr
 
     low, high = np.zeros_like(radius), np.minimum(radius + 1.0, reach)
     with np.errstate(all="ignore"):
-        for _ in range(40):  # a lens whose distortion grows without end
+        for _ in range(40):  # the distortion of a lens may grow without end
             high = np.minimum(np.where(imaged(high) < radius, 2.0 * high, high), reach)
         for _ in range(60):
             middle = 0.5 * (low + high)

@@ -22,7 +22,7 @@ from coopenv.estimation.observability import Observability, Trajectory, slowest_
 from coopenv.estimation.poses import Array, Coordinates, covariance_in_map, orientation_error_deg
 
 STEADY_SHARE = 0.7  # the steady state is taken to begin after this share of the horizon (35 s of 50 s)
-MOST_SHOWN = 12  # vehicles that figures and printed tables show; of a larger fleet, those of the largest errors
+MOST_SHOWN = 12  # vehicles in figures and printed tables; of a larger fleet, the ones with the largest errors
 MIRROR_ANGLE_DEG = 150.0  # an orientation error above it at the end of a run is the mirrored solution, not a slow one
 
 
@@ -43,7 +43,7 @@ class SettlingTolerance(NamedTuple):
         return (position_error < self.position_m) & (orientation_error < self.orientation_deg)
 
 
-SETTLED = SettlingTolerance("settled", 0.5, 5.0)  # what an estimate can keep under measurement noise
+SETTLED = SettlingTolerance("settled", 0.5, 5.0)  # attainable under measurement noise
 CONVERGED = SettlingTolerance("converged", 0.1, 1.0)
 _NOT_CONVERGED = "did not converge, no rate to fit"
 _FIT_SAMPLES = 400  # Theil-Sen looks at every pair: 80 000 slopes
@@ -62,9 +62,9 @@ class RateFit(NamedTuple):
 
 
 def steady_start(given: float | None, horizon: float, end: float | None = None) -> float:
-    """Return when the steady state starts, s: as given by the user, or after `STEADY_SHARE` of the horizon, s.
+    """Return the start of the steady state, s: as given by the user, or after `STEADY_SHARE` of the horizon, s.
 
-    What is given has to lie within the run, which ends at `end`, s, where it is cut short of the horizon.
+    A given start has to lie within the run, which ends at `end`, s, if it ends before the horizon.
     """
     if given is None:
         return STEADY_SHARE * horizon
@@ -77,7 +77,7 @@ def steady_start(given: float | None, horizon: float, end: float | None = None) 
 def live_ticks(t: np.ndarray, vehicles: int, ends: Sequence[float] | None = None) -> np.ndarray:
     """Return (N,) the number of ticks (K,) up to each vehicle's end, the tick of its end included.
 
-    `ends` is when each arrived or collided and was parked, s: NaN or beyond the record for one that was not.
+    `ends` is the time of each arrival or collision, s: NaN or beyond the record for a vehicle still under way.
     """
     if ends is None:
         return np.full(vehicles, len(t))
@@ -211,12 +211,12 @@ def shown_vehicles(trajectory: Trajectory, steady_from: float, ends: Sequence[fl
 
 
 def shown_note(count: int) -> str:
-    """Return which vehicles of a fleet `shown_vehicles` chooses, in words; nothing where these are all."""
+    """Return in words the choice of `shown_vehicles` from a fleet; empty if it is all vehicles."""
     return f"{MOST_SHOWN} worst of {count} vehicles, by RMSE of the position" if count > MOST_SHOWN else ""
 
 
 def summarise(trajectory: Trajectory, steady_from: float, ends: Sequence[float] | None = None) -> list[dict[str, Any]]:
-    """Return one dict of plain Python values per vehicle, units in the keys; what does not exist is NaN or None.
+    """Return one dict of plain Python values per vehicle, units in the keys; missing values are NaN or None.
 
     Steady RMSE and mean NEES are over the ticks after `steady_from`, s; nothing counts after `ends`, see `live_ticks`.
     """
@@ -268,7 +268,7 @@ class Interval(NamedTuple):
 
 
 def mean_bounds(dof: int, runs: int = 1) -> Interval:
-    """Return where the mean over independent runs of a chi-square of `dof` degrees, divided by `dof`, lies.
+    """Return the interval of the mean over independent runs of a chi-square of `dof` degrees, divided by `dof`.
 
     For ANEES the runs are Monte Carlo runs at one instant: ticks of one run are correlated, so the bounds do not hold
     for a mean over time. For NIS, which is white over time, a run may be a tick. `LEVEL` is the probability of lying
@@ -309,7 +309,7 @@ class RelativeError(NamedTuple):
 
 
 def absolute_error(position: Array, position_estimate: Array) -> float:
-    """Return ATE: the root mean square of |p - phat| in m, of positions (K, 3), over the ticks whose truth is known."""
+    """Return ATE: the root mean square of |p - phat| in m, of positions (K, 3), over the ticks with known truth."""
     known = np.isfinite(position).all(axis=-1)
     if not known.any():
         return float("nan")

@@ -148,7 +148,7 @@ class Trajectory(RecordedGeometry, Tabular):
         return np.asarray(np.isfinite(self.position).all(axis=-1) & np.isfinite(self.rotation).all(axis=(-2, -1)))
 
     def with_truth(self, vehicles: Sequence[int]) -> list[int]:
-        """Return those of some vehicles whose true poses are known, at two ticks or more; none without common ticks.
+        """Return the geometry of some vehicles with known true poses, at two ticks or more; None without common ticks.
 
         Of cars without motion capture nothing is known; if so of some, the others have errors all the same.
         """
@@ -247,7 +247,7 @@ def analyse_observability(
 ) -> Observability:
     """Evaluate W(t) for every camera tick at which a whole window begins.
 
-    True poses and the visibility of the run are used: the question is what could be seen, not what was made
+    True poses and the visibility of the run are used: the question is the available information, not its use
     of it. Neighbours count as known, as in the theorem, which takes the vehicles one after the other along
     the graph. The window is in s; the threshold is the verdict on the local eigenvalue, see `Observability`.
     """
@@ -343,7 +343,7 @@ def convergence_rates(
     """Return the rates of the paper's observer along a record.
 
     Args:
-        scene: true positions and what was seen.
+        scene: true positions and visibility.
         k: gain of each vehicle (N,), above 0.5.
         q: weight of each target (T,).
         V: diagonal of V over 2 lambda and over p.

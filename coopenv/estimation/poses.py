@@ -183,7 +183,7 @@ def orientation_error_deg(rotation: np.ndarray, rotation_estimate: np.ndarray) -
 def error_dof(rotation: Array, position: Array, rotation_estimate: Array, position_estimate: Array) -> int:
     """Return the degrees of freedom of the errors of poses (..., 3, 3) and (..., 3): 6, or 3 if none leaves a plane.
 
-    So are those of robots whose estimates are planar. Poses that are NaN do not count.
+    Planar estimates of robots have them, too. Poses that are NaN do not count.
     """
     tilt = np.abs(np.asarray(rotation_estimate)[..., 2, :] - np.asarray(rotation)[..., 2, :]).max(axis=-1)
     height = np.abs(np.asarray(position_estimate)[..., 2] - np.asarray(position)[..., 2])
@@ -310,7 +310,7 @@ Mask = NDArray[np.bool_]
 Fields = Mapping[str, Values]
 
 MAX_BEND = 1e-6
-"""By how much entries of R^T R may differ from those of I, and the squared length of a direction from 1."""
+"""Tolerance of the entries of R^T R, and of the squared length of a direction."""
 MOST_LOPSIDED = 1e-6
 """By how much a covariance and its transpose may differ, relative to it, in Frobenius' norm."""
 MAX_ASYMMETRY = 1e-6
@@ -325,7 +325,7 @@ class Rule(NamedTuple):
     """Returns which elements satisfy it, from the array, all arrays by name, and the model (None: there is none)."""
     axes: int = 0  # how many of the last axes make up an element: 1 for vectors, 2 for matrices
     used: str = ""
-    """Array that says which elements count, by flags or by how many along the last axis; empty: all do. The others must
+    """Array of the elements that count, by flags or by their number along the last axis; empty: all do. The others must
     be finite."""
     of_truth: bool = False  # whether it is truth, which a recording may not know: NaN
 
@@ -334,7 +334,7 @@ class Rule(NamedTuple):
         return everywhere(mask, *range(-self.axes, 0))
 
     def valid(self, array: Values, fields: Fields, model: Any, knows_truth: bool) -> Mask:
-        """Return which elements satisfy it, do not count, or are not known."""
+        """Return flags of elements that satisfy it, do not count, or are unknown."""
         valid = self.holds(array, fields, model)
         if self.used:
             used = fields[self.used]
@@ -347,12 +347,12 @@ class Rule(NamedTuple):
 
 
 def are_numbers(values: Values) -> Mask:
-    """Return where values are finite and not beyond any quantity."""
+    """Return flags of finite values within the largest quantity."""
     return np.asarray(np.abs(values) <= LARGEST)
 
 
 def everywhere(mask: Mask, *axes: int) -> Mask:
-    """Return where a mask holds all along some axes."""
+    """Return flags of entries at which a mask is true along all of some axes."""
     return np.asarray(mask.all(axis=axes))
 
 
@@ -375,7 +375,7 @@ def are_rotations(matrices: Values, tolerance: float = MAX_BEND) -> Mask:
 def are_covariances(matrices: Values, least: float) -> Mask:
     """Return (...) which matrices (..., n, n) are symmetric, not too large, and definite enough.
 
-    `least` is the smallest eigenvalue that their correlations may have; below 0 for those that are singular or rounded.
+    `least` is the smallest eigenvalue that their correlations may have; below 0 for singular or rounded ones.
     """
     P = np.asarray(matrices, dtype=np.float64)
     bounded = everywhere(np.abs(P) <= LARGEST**2, -1, -2)

@@ -1,4 +1,4 @@
-"""Episodes in every world of a batch: stepping, and what drivers are judged by."""
+"""Episodes in every world of a batch: stepping, and the records that drivers are judged by."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -119,7 +119,7 @@ def play(
     """Start an episode in every world and yield the number of camera ticks since then, from 0, once they are there.
 
     Args:
-        engine: what is run, on any backend; it is stopped when something fails meanwhile.
+        engine: the engine to run, on any backend; it is stopped at an error.
         seeds: of the batch, or one per world.
         ticks: after the start; fewer where the backend has no more.
         policy: drives every vehicle, its rows are (world, vehicle); None: action zero.
@@ -156,7 +156,7 @@ def play(
 
 
 def estimated_here(engine: Engine) -> tuple[int, ...]:
-    """Return which vehicles are estimated here, not elsewhere and received by radio."""
+    """Return flags of the vehicles that are estimated here, not elsewhere and received by radio."""
     here = engine.backend.capabilities.estimated
     return tuple(range(engine.world.model.vehicles)) if here is None else here
 
@@ -191,7 +191,7 @@ def drive(
     Args:
         engine: the worlds.
         policy: drives every vehicle; its rows are (world, vehicle).
-        seeds: one per world.
+        seeds: a seed per world.
         on_progress: called with the share of the horizon that is done.
 
     Raises:

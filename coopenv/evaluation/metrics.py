@@ -47,7 +47,7 @@ class Ratio:
 
 
 class Quantile:
-    """A quantile of what all worlds have seen together."""
+    """A quantile over the values of all worlds together."""
 
     def __init__(self, values: np.ndarray, world: np.ndarray, worlds: int, share: float, bins: int = _BINS) -> None:
         """Count values, (M,), of worlds, (M,) in 0..worlds-1, in fine bins.
@@ -89,7 +89,7 @@ Statistic = Ratio | Quantile
 
 
 def resamples(worlds: int, seed: int, count: int = RESAMPLES) -> np.ndarray:
-    """Return how often every world is drawn, (count, worlds), when as many as there are are drawn with replacement."""
+    """Return the counts (count, worlds) of each world in bootstrap draws with replacement, as many draws as worlds."""
     generator = np.random.default_rng([seed, worlds])
     return generator.multinomial(worlds, np.full(worlds, 1.0 / worlds), size=count).astype(float)
 
@@ -105,7 +105,7 @@ def interval(values: np.ndarray) -> Interval:
 
 COLLIDED = Outcome.COLLIDED
 SETTLED_FROM = 3.0
-"""s from which on errors count: before it they are those of the initial estimate."""
+"""Time (s) from which errors count: before it they are the initial estimate's."""
 FEW_TARGETS = 3
 """Fewer bearings than these do not determine a pose."""
 
@@ -231,7 +231,7 @@ def score(episodes: Episodes, seed: int = 0) -> list[Result]:
 
 
 def compare_paired(episodes: Episodes, other: Episodes, seed: int = 0) -> list[Difference]:
-    """Return by how much the figures of a driver differ from another's on the same worlds.
+    """Return the differences between the figures of two drivers on the same worlds.
 
     Travel times are compared over the vehicles that arrive with both.
     """

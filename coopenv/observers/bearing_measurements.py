@@ -251,7 +251,7 @@ def linearised(pose: UncertainPose, tick: Tick, measured: BearingMeasurements) -
 def linearise(
     R: Array, p: Array, right: bool, lever_arm: Array, bearings: Array, positions: Array, C: Array, variance: float
 ) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
-    """Return what `LinearisedBearings` holds; `right`: the error is about the map's axes.
+    """Return the fields of `LinearisedBearings`; `right`: the error is about the map's axes.
 
     With the rows j of J, and g = R j, the derivative by a left error is (j x a, -j), by a right one (g x z, -g).
     """

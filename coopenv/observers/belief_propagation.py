@@ -121,7 +121,7 @@ class BeliefPropagation(GraphEstimator):
         self.first = first
 
     def broadcast(self, ticks: Sequence[Tick]) -> list[Message]:
-        """Return what each vehicle sent for this tick: its pose, and one message per factor, direction and pass."""
+        """Return each vehicle's messages for this tick: its pose, and a message per factor, direction and pass."""
         k = self.graph.frames - 1
         return [
             Message(

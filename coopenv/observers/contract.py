@@ -238,7 +238,7 @@ class Observer(Protocol):
         """Take one camera tick."""
 
     def message(self) -> Message:
-        """Return what to broadcast now; called after `update` (or `reset`) when a message is due."""
+        """Return the message to broadcast now; called after `update` (or `reset`) when a message is due."""
 
 
 @runtime_checkable
@@ -257,7 +257,7 @@ class JointObserver(Protocol):
         """Take one camera tick of every vehicle; received messages in it are empty."""
 
     def messages(self) -> list[Message]:
-        """Return what each vehicle had to send for this tick."""
+        """Return the message of each vehicle for this tick."""
 
 
 Factory = Any  # builds an `Observer` from a `Setup`, or a `JointObserver` from a sequence of them

@@ -227,7 +227,7 @@ def halfway_gain(
 
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)
 def own_gain(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, Array, float]:
-    """Return what `halfway_gain` does without neighbours."""
+    """Return the result of `halfway_gain` without neighbours."""
     return halfway_gain(kind, R, p, P, frame, np.zeros((0, 3, 3)), np.full(len(frame[1]), -1))
 
 

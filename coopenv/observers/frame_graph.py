@@ -92,7 +92,7 @@ class FrameGraph:
         self.frames, self.begin[k + 1] = k + 1, self.begin[k]
 
     def add(self, vehicle: int, targets: NDArray[np.int64], bearings: Array, points: Array) -> None:
-        """Add m bearings (m, 3) of a vehicle to the last frame; points (m, 3) are those of landmarks, map, m."""
+        """Add m bearings (m, 3) of a vehicle to the last frame; points (m, 3) of landmarks, map, m."""
         first = int(self.begin[self.frames])
         end = first + len(targets)
         observer, target, bearing, point = self.bearings
@@ -197,7 +197,7 @@ class GraphEstimator(ABC):
         return [measured_message(tick) for tick in ticks]
 
     def messages(self) -> list[Message]:
-        """Return what each vehicle sent for this tick."""
+        """Return the message of each vehicle for this tick."""
         return self.sent
 
     def judge(self, count: Array) -> None:
@@ -243,7 +243,7 @@ def motion(before_R: Array, before_p: Array, R: Array, p: Array, turn: Array, sh
 
 @compiled(MATRICES, MATRIX, SEEN, VEHICLES)
 def pair_information(R: Array, p: Array, seen: Bearings, vehicles: Vehicles) -> tuple[Array, Array]:
-    """Return what `FrameGraph.pairs` does, from its arrays."""
+    """Return the result of `FrameGraph.pairs` from its arrays."""
     (observer, target, bearing, point), (cameras, markers, variance, scaled), N = seen, vehicles, len(R)
     information, count = np.zeros((N, N, 12, 13)), np.zeros((N, 2))
     J, row = np.zeros((2, 13)), np.zeros(6)  # derivatives, and the residual as the last column

@@ -185,7 +185,7 @@ class ObserverGroup:
             raise CoopenvError(f"the observers' state cannot be copied: {error_text(error)}") from error
 
     def checked_state(self, state: Any, begun: bool) -> dict[str, Any]:
-        """Return what `set_state` takes, from what `get_state` of such a group returned before or after a start.
+        """Return a checked state for `set_state`, from a state of `get_state` of such a group, before or after a start.
 
         A CoopenvError means that it is of another group. The observers in it are not checked: they can run any code.
         """
@@ -206,6 +206,6 @@ class ObserverGroup:
         return dict(copied)
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go back to what `checked_state` returned."""
+        """Restore a state of `checked_state`."""
         vars(self).pop("mail", None)
         vars(self).update(state)

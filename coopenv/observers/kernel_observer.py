@@ -245,7 +245,7 @@ class KernelFactory:
 
 
 def write_position(observer: KernelObserver) -> Message:
-    """Return where the vehicle's marker is."""
+    """Return the position of the vehicle's marker."""
     s = observer.state
     return Message(position=s.estimate_rotation @ (s.estimate_position + observer.setup.marker))
 

@@ -41,7 +41,7 @@ class Mailbox:
     def __init__(self, observer_init: ObserverInit) -> None:
         self.observer_init = observer_init
         self.sent: list[dict[int, Message | None]] = [{} for _ in observer_init.setups]
-        """Per sender: tick of sending to message, of those that may still be under way; None: it is invalid."""
+        """Per sender: tick of sending to message, of messages that may still be under way; None: invalid."""
         self.replayable: list[dict[int, Message]] = [{} for _ in observer_init.setups]
         """Per sender that may replay: tick to its message before the fault."""
         self.received: list[dict[int, LastReceived]] = [{} for _ in observer_init.setups]
@@ -50,7 +50,7 @@ class Mailbox:
         self.refused = np.zeros(len(observer_init.setups), dtype=np.int64)
         """Per receiver: invalid messages."""
         self.forms: dict[int, tuple[int, ...]] = {}
-        """Per vehicle: the shape of the covariances that it sends itself, in which it expects those of others."""
+        """Per vehicle: shape of its covariances in messages, which it expects of its neighbours, too."""
         self._senders = [[int(t) for t in setup.targets if t >= setup.landmarks] for setup in observer_init.setups]
         """Per receiver: the targets that are vehicles."""
 

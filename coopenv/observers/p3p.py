@@ -138,7 +138,7 @@ def directions_in(plane: Any, null: Any, cone: Any):
 
 
 NEWTON_STEPS = 3
-TOLERANCE = 1e-8  # what a solution may miss of the squared sides, relative to the longest
+TOLERANCE = 1e-8  # largest misfit of a solution's squared sides, relative to the longest
 FLAT = 1e-9  # twice a triangle's area over its longest squared side: below it the points are on a line
 EIGHTH_TURN = 0.7853981633974483
 
@@ -243,7 +243,7 @@ def is_valid(b: Any, z: Any, longest: Any):
 
 @wp.func
 def solve_triangle(b: Any, z: Any):
-    """Return how many solutions there are for bearings and points, rows, and the distances, the nearest first."""
+    """Return the number of solutions for bearings and points, rows, and the distances, the nearest first."""
     sides = vec3d(wp.length_sq(z[0] - z[1]), wp.length_sq(z[0] - z[2]), wp.length_sq(z[1] - z[2]))
     longest = wp.max(sides)
     count = int(0)

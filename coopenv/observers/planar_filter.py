@@ -89,13 +89,13 @@ class PlanarFilter:
         return self.move(dt)
 
     def command(self, dt: float, turn: float, path: float) -> None:
-        """Take what was commanded over the last dt in s."""
+        """Take the commands over the last dt in s."""
         if self.history is None:
             self.history = CommandHistory(self.tuning.wheels, MAX_LEAD_S, dt)
         self.history.add(dt, turn, path)
 
     def move(self, dt: float) -> OdometryStep:
-        """Move the estimate on by dt in s, by what was commanded."""
+        """Propagate the estimate by the commands over dt in s."""
         if self.history is None:
             return OdometryStep(0.0, 0.0, 0.0, 0.0)
         k, s = self.tuning, self.state.tolist()  # numbers of Python: those of NumPy are slow one by one
@@ -140,7 +140,7 @@ class PlanarFilter:
         return OdometryStep(turned, driven, q_turn, q_path)
 
     def _astray(self, driven: float) -> tuple[float, tuple[float, float]]:
-        """Return what a path in m shrinks by, and what an unsure heading adds along and across, m^2.
+        """Return the shrinkage of a path in m, and the variances of an uncertain heading along and across it, m^2.
 
         The heading's error lasts, so that what it adds grows by lengths and not by variances.
         """
@@ -295,7 +295,7 @@ class Mixture:
 
     @property
     def covariance(self) -> Array:
-        """Covariance of the state, with what the filters differ in."""
+        """Covariance of the state, including the spread of the filters."""
         return self.filters[0].covariance if len(self.filters) == 1 else self._moments()[1]
 
     def advance(self, dt: float, turn: float, path: float) -> OdometryStep:

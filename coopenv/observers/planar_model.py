@@ -44,7 +44,7 @@ def left_out(dx: float, dy: float, square: float, covariance: Array) -> float:
 
 
 def unsure(variance: float) -> tuple[float, float, float]:
-    """Return what a straight path becomes under a normal error of its heading of a variance in rad^2.
+    """Return the moments of a straight path under a normal error of its heading of a variance in rad^2.
 
     By what its mean shrinks, and the standard deviations along and across it, relative to its length, of what the best
     linear function of the heading leaves: e^(-u/2), (1 - e^-u) / sqrt 2 and sqrt((1 - e^-2u) / 2 - u e^-u).
@@ -116,7 +116,7 @@ class CommandHistory:
         self._rate = 0.0
 
     def add(self, dt: float, turn: float, path: float) -> None:
-        """Take what was commanded over the last dt in s: rad, m."""
+        """Take the commands over the last dt in s: rad, m."""
         v, w = path / dt, turn / dt
         turning = dt if abs(w) > TURNING_RATE else 0.0
         gain = self._wheels.gain(v, w) if turning else 1.0
@@ -127,7 +127,7 @@ class CommandHistory:
         self._rate = w
 
     def response(self, dt: float, lead: float) -> tuple[Array, Array]:
-        """Return what the wheels did in the last dt in s (7,), if commands are early by `lead` in s, and d/dlead."""
+        """Return the wheels' terms (7,) of the last dt in s, if commands are early by `lead` in s, and d/dlead."""
         now, half = self._t[-1] - lead, dt / 2
         ends = np.array([now - dt - half, now - dt, now - half, now, now + half])
         at = (ends[:, None] - self._delay).ravel()
@@ -209,7 +209,7 @@ WEIGHTS = 0.04 * np.arange(24, 0, -1)
 
 
 def growth(own: float, gain: float, cost: float, theirs: float, noise: float, dependent: float) -> tuple[float, float]:
-    """Return by what our and their covariance grow before they are fused, so that less is left (else 0, 0).
+    """Return the inflation of the own and the neighbour's covariance before fusion, if it helps (else 0, 0).
 
     Split covariance intersection: Li, Nashashibi, "Cooperative multi-vehicle localization using split covariance
     intersection filter", IEEE ITS Magazine 5(2), 2013; the weight is searched on a grid. `own` is h P h^T, `gain` are

@@ -180,7 +180,7 @@ class Recording(Measurements):
         )
 
     def at(self, k: int) -> Sensed:
-        """Return what all vehicles sense at tick k."""
+        """Return the measurements of all vehicles at tick k."""
         sensed: dict[str, Any] = {name: getattr(self, name)[k] for name in PER_TICK}
         truth = Truth(self.truth.rotation[k], self.truth.position[k])
         if self.pan is not None:
@@ -204,7 +204,7 @@ class Recording(Measurements):
         )
 
     def tick(self, k: int, vehicle: int, messages: Mapping[int, Received]) -> Tick:
-        """Return what one vehicle senses at tick k, with the messages that it has."""
+        """Return the measurements of one vehicle at tick k, with its messages."""
         return self.at(k).tick(self.setups[vehicle], messages)
 
 
@@ -278,7 +278,7 @@ ARRAYS = {
     "start_position": ArraySpec("N3", VECTOR),
     "start_covariance": ArraySpec("N66", COVARIANCE),
 }
-"""Arrays by name; those of the truth are fields of `Truth`."""
+"""Arrays by name; arrays of the truth are fields of `Truth`."""
 MEASURED = tuple(field.name for field in fields(Measurements))
 """Arrays that every tick has."""
 PER_TICK = (*MEASURED, "inbox_tick")
@@ -294,7 +294,7 @@ def sizes_of(setups: Sequence[Setup]) -> dict[str, int]:
 
 
 def _misshapen(values: Mapping[str, Any], sizes: Mapping[str, int], kinds: Mapping[str, str]) -> Iterator[str]:
-    """Yield what is wrong with arrays that have another shape or type than the table says."""
+    """Yield the errors of arrays with a shape or type other than the table's."""
     for name, value in values.items():
         spec = ARRAYS[name]
         shape, kind = spec.shape(sizes), kinds[spec.kind]
@@ -308,8 +308,8 @@ def _invalid(values: Mapping[str, Array], about: Mapping[str, Any], ticks: bool)
 
     Args:
         values: arrays by name.
-        about: what rules need besides: the tick `now` and the message period.
-        ticks: whether arrays have the axis K.
+        about: further inputs of rules: the tick `now` and the message period.
+        ticks: True if arrays have the axis K.
     """
     for name, array in values.items():
         axes, rule = ARRAYS[name].axes, ARRAYS[name].rule

@@ -1,4 +1,4 @@
-"""Observers by name: those of this package, those registered in the program, and those of installed packages.
+"""Observers by name: of this package, registered in the program, and of installed packages.
 
 An observer is a class, or a function of a setup, that runs on the host (`contract.Observer`), or it has kernels
 (`coopenv.world.embedded.Embedded`), which run in worlds and, for one vehicle, on the host as well; or it has both.

@@ -229,7 +229,7 @@ def kalman_step(
 def modal_step(
     k: Any, h: Any, limit: Any, last: bool, M11: Any, M12: Any, M22: Any, L11: Any, L21: Any, L22: Any, r1: Any, r2: Any
 ):
-    """Return what `kalman_step` does for any gain k, through the modes of L^T M L."""
+    """Return the result of `kalman_step` for any gain k, through the modes of L^T M L."""
     taken = h
     T, spectrum = correction_modes(M11, M12, M22, L11, L21, L22)
     dx1, dx2 = correct_modes(k, taken, T, spectrum, r1, r2)
@@ -244,7 +244,7 @@ def modal_step(
 def gain_step(
     k: Any, h: Any, limit: Any, last: bool, M11: Any, M12: Any, M22: Any, L11: Any, L21: Any, L22: Any, r1: Any, r2: Any
 ):
-    """Return what `kalman_step` does, by the shorter way where k = 1."""
+    """Return the result of `kalman_step`, by a shorter computation where k = 1."""
     if k == type(k)(1.0):
         taken, dx1, dx2, A, B, D = kalman_step(k, h, limit, last, M11, M12, M22, L11, L21, L22, r1, r2)
     else:

@@ -10,7 +10,7 @@ from coopenv.base.errors import ActionError, shown
 
 
 class Policy(Protocol):
-    """Maps what vehicles observe to their actions; a function, or an object that can be called.
+    """Maps observations of vehicles to their actions; a function, or an object that can be called.
 
     It chooses for all rows of a batch at once, each from its own observation alone. A policy with
     memory also has a method `reset(mask)`, see `restart`, and gets the same rows, in the same order, every time.

@@ -71,7 +71,7 @@ class AgentCard(Section):
     environments: tuple[str, ...]
     """Environments that it was made for: names, or TOML files in the agent's folder."""
     kind: Kind = "scripted"
-    """Trained, scripted, or a reference for what is possible."""
+    """Trained, scripted, or a reference for the achievable."""
     options: dict[str, Any] = Field(default={})
     """Keyword arguments of the entry."""
     network: NetworkCard | None = None
@@ -83,7 +83,7 @@ class AgentCard(Section):
 
 
 class Agent(AgentCard):
-    """A driver that has been found, not yet built: what its card holds, as it means the same from any folder.
+    """A driver that has been found, not yet built: the contents of its card, valid in any folder.
 
     One of an import path has no more than a name and an entry: a class, which is built with the scenario and the
     options, or else a policy.
@@ -166,7 +166,7 @@ class ModelPolicy:
         self._begins = np.zeros(0, dtype=bool)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Forget what belongs to the episodes of rows in a mask (rows,)."""
+        """Clear the memory of the rows in a mask (rows,)."""
         same = len(mask) == len(self._begins)
         self._begins = self._begins | mask if same else np.ones(len(mask), dtype=bool)
         self._state = self._state if same else None

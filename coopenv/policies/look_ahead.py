@@ -1,4 +1,4 @@
-"""Planning of headings by predicted pose covariances over sampled plans; a reference for what is possible."""
+"""Planning of headings by predicted pose covariances over sampled plans; a reference for the achievable."""
 
 from functools import partial
 from itertools import product
@@ -48,7 +48,7 @@ class _Sight(NamedTuple):
     """Measurable targets in some rows."""
 
     landmarks: np.ndarray
-    """(rows, K, 2), m, own frame: those that are of use in any row."""
+    """Points (rows, K, 2), m, own frame, that are of use in any row."""
     known: np.ndarray
     """(rows, 1, K), which of them are."""
     boxes: list[Occluder]
@@ -158,7 +158,7 @@ class LookAhead(RouteFollower):
         return []
 
     def avoided(self, senders: np.ndarray, vehicle: np.ndarray) -> np.ndarray:
-        """Return those of the senders, (rows, M), that plans keep away from: all to which the vehicle gives way."""
+        """Return flags (rows, M) of the senders that plans keep away from: all to which the vehicle gives way."""
         return self.before(senders, vehicle)
 
     def costs(self, observations: np.ndarray, vehicle: np.ndarray, followers: list[_Follower]) -> np.ndarray:
@@ -175,7 +175,7 @@ class LookAhead(RouteFollower):
         theirs = self._top[by_place(senders, mask.shape[1])][..., None]
         followers = [each._replace(covariance=_repeated(each.covariance, zero.shape[1])) for each in followers]
         avoided, others = self.avoided(mask, vehicle), others + self.body_center * forward
-        # Whoever gives way is expected to stand, and is passed as closely as can be.
+        # A vehicle that gives way is expected to stand, and is passed as closely as possible.
         theirs = np.where(avoided[..., None], theirs, 0.0)
         keep = np.where(avoided, keep, self.blocking)[:, None]
         cost, missing = np.zeros_like(now.x), zero
@@ -219,7 +219,7 @@ class LookAhead(RouteFollower):
         return np.where(away, np.inf, cost - now.along / top + BACK * np.abs(now.aside))
 
     def _sight(self, observations: np.ndarray, vehicle: np.ndarray) -> _Sight:
-        """Return what can be measured in rows that are of these vehicles."""
+        """Return the measurable targets in the rows of these vehicles."""
         known = (self.known(observations) & self._sees_landmarks[vehicle][:, None])[:, None]
         useful = known.any(axis=(0, 1))
         landmarks = self.read(observations, "map_position")[..., :2][:, useful]
@@ -286,7 +286,7 @@ def _senders(vehicle: np.ndarray, slots: int) -> np.ndarray:
 
 
 class TeamLookAhead(LookAhead):
-    """The planner for the fleet: plans also have a pace, and cost what they make other vehicles lose.
+    """The planner for the fleet: plans also have a pace, and a cost for the losses of other vehicles.
 
     For every vehicle that may measure the planning one, the covariance of that vehicle is predicted, with the bearings
     to the planning vehicle as the only ones; its uncertainty costs as much as the own. It plans with the covariances of

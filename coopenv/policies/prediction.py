@@ -188,7 +188,7 @@ def _footprint(body: Body | None) -> float:
 def unhidden(
     boxes: list[Occluder], seen: np.ndarray, camera: np.ndarray, points: np.ndarray, distance: float
 ) -> np.ndarray:
-    """Return which points in view no box hides, (rows, P, K) bool.
+    """Return flags (rows, P, K) of points in view that no box occludes.
 
     Args:
         boxes: of `Occluders.boxes`.
@@ -255,7 +255,7 @@ class FieldOfView:
         return np.asarray((distance <= self.reach) & (angle <= self.left) & (angle >= self.right))
 
     def odds(self, offset: np.ndarray, heading: np.ndarray, angle_std: np.ndarray, range_std: np.ndarray) -> np.ndarray:
-        """Return how likely points are in view where their direction and distance are uncertain, (...) in [0, 1].
+        """Return the probability (...) that points of uncertain direction and distance are in view.
 
         Args:
             offset: (..., 2), m, from the vehicle's reference point.
@@ -294,7 +294,7 @@ def at_arc_lengths(points: np.ndarray, distance: np.ndarray, s: np.ndarray) -> n
 
 
 def right_of_way(scenario: Scenario) -> np.ndarray:
-    """Return over whose messages each vehicle has the right of way, (N, N - 1): of driven vehicles after it in order.
+    """Return flags (N, N - 1) of the senders that give way to each vehicle: the driven vehicles after it in order.
 
     None, where some driven vehicle does not receive another one's messages. With `topology.most_nearby` the senders are
     not known, so there are (N, M) for the M kept ones, and none.
@@ -310,7 +310,7 @@ def right_of_way(scenario: Scenario) -> np.ndarray:
 
 
 def on_circle(velocity: np.ndarray, curvature: np.ndarray, time: float) -> np.ndarray:
-    """Return how far, (rows, M, 2) in m, vehicles get in a time, s, with velocities, m/s, and curvatures, 1/m."""
+    """Return the displacements (rows, M, 2), m, of vehicles in a time, s, by velocities, m/s, and curvatures, 1/m."""
     half = curvature * np.linalg.norm(velocity, axis=-1) * (time / 2.0)  # rad, between the velocity and the chord
     x, y, c, s = velocity[..., 0], velocity[..., 1], np.cos(half), np.sin(half)
     return np.asarray((time * np.sinc(half / np.pi))[..., None] * np.stack([c * x - s * y, s * x + c * y], axis=-1))

@@ -60,11 +60,11 @@ class Driver(ABC):
         self._memory = np.zeros((self.remembers, 0), dtype=int)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Begin new episodes in the rows of a mask: what is remembered of them is 0."""
+        """Begin new episodes in the rows of a mask: their memory is 0."""
         self.memory(mask)[:, mask] = 0
 
     def memory(self, rows: np.ndarray) -> np.ndarray:
-        """Return what is remembered, (remembers, rows); 0 where there are more or fewer rows than before."""
+        """Return the memory (remembers, rows); 0 if the number of rows has changed."""
         if len(rows) != self._memory.shape[1]:
             self._memory = np.zeros((self.remembers, len(rows)), dtype=int)
         return self._memory
@@ -87,7 +87,7 @@ class Driver(ABC):
         return self.layout[name].values(observations)
 
     def known(self, observations: np.ndarray) -> np.ndarray:
-        """Return which landmarks of the map there are, (rows, K): all, where the observation has no `map_mask`."""
+        """Return flags (rows, K) of existing landmarks of the map: all, if the observation has no `map_mask`."""
         if "map_mask" in self.layout:
             return self.read(observations, "map_mask") > 0.5
         return np.ones((len(observations), self.layout["map_position"].shape[0]), dtype=bool)
@@ -199,7 +199,7 @@ class RouteFollower(Driver):
         self.paces = (1.0,) if nimble else (0.0, 0.25, 0.5, 0.75, 1.0)
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """See `Driver.__call__`; the leaps of senders are appended to what it observes."""
+        """See `Driver.__call__`; the jumps of senders are appended to the observations."""
         observations = np.asarray(observations, dtype=np.float32)
         return super().__call__(np.concatenate([observations, self.leaps(observations)], axis=1))
 
@@ -208,7 +208,7 @@ class RouteFollower(Driver):
         return self.speed(observations), self.pursue(self.direction(observations))
 
     def leaps(self, observations: np.ndarray) -> np.ndarray:
-        """Return by how much senders have leapt, (rows, 2 M) in m, own frame; no columns where that is not known."""
+        """Return the jumps of senders (rows, 2 M), m, own frame; no columns where they are unknown."""
         known = {"message_position", "message_age", "velocity", "angular_velocity"} <= {*self.layout}
         if not known or not self.senders_known:
             return np.zeros((len(observations), 0), dtype=np.float32)
@@ -230,7 +230,7 @@ class RouteFollower(Driver):
         return leapt.reshape(len(place), -1).astype(np.float32)
 
     def received(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what `reported` does, and behind it the senders that have leapt where they would be otherwise."""
+        """Return the result of `reported`, followed by senders that have jumped, at extrapolated positions."""
         mask, place, forward = self.reported(observations)
         if observations.shape[1] == self.layout.size:
             return mask, place, forward
@@ -251,7 +251,7 @@ class RouteFollower(Driver):
         return mask, place, forward
 
     def before(self, senders: np.ndarray, vehicle: np.ndarray) -> np.ndarray:
-        """Return those of the senders, (rows, M), over which the rows' vehicles, (rows,), have no right of way."""
+        """Return flags (rows, M) of the senders to which the rows' vehicles, (rows,), give way."""
         if not self.goes_first.any():
             return senders
         return np.asarray(senders & ~by_place(self.goes_first[vehicle], senders.shape[1]))
@@ -318,7 +318,7 @@ class RouteFollower(Driver):
         return np.asarray(centres.reshape(len(place), -1, 2))
 
     def body_centers(self, points: np.ndarray) -> np.ndarray:
-        """Return where the center of the own body is, (rows, P, 2) in m, with the reference point at these of a way."""
+        """Return the centers (rows, P, 2), m, of the own body with the reference point at the points of a path."""
         ways = np.diff(points, axis=1)
         ways /= np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-9)
         ahead = np.concatenate([np.broadcast_to([1.0, 0.0], ways[:, :1].shape), ways], axis=1)
@@ -377,7 +377,7 @@ class RouteFollower(Driver):
         return np.asarray(speed * times + self.braking * gains * (times - gains / 2.0))
 
     def swept(self, points: np.ndarray, distance: np.ndarray, s: np.ndarray) -> list[np.ndarray]:
-        """Return where the centres of the own discs are, (rows, P, 2) each, at arc lengths (rows, P) of the route."""
+        """Return the centres of the own discs, (rows, P, 2) each, at arc lengths (rows, P) of the route."""
         along = [at_arc_lengths(points, distance, arc) for arc in (s, s + 0.1)]
         forward = along[1] - along[0]
         forward /= np.maximum(np.linalg.norm(forward, axis=-1, keepdims=True), 1e-9)

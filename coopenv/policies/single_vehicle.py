@@ -24,7 +24,7 @@ MOST_EPISODES = 1000
 
 
 def driver_of(others: str | Policy | None, scenario: Scenario) -> Policy:
-    """Return what `load_agent` does, for None `route_follower`, or straight on where that cannot drive."""
+    """Return the policy of `load_agent`, for None `route_follower`, or straight on where that cannot drive."""
     if not (others is None or isinstance(others, str | Path) or callable(others) or hasattr(others, "predict")):
         expected = "expected one agent for all other vehicles, a name, a folder, file.py:Class or a policy"
         raise CoopenvError(f"others: {expected}, got {shown(others)}")

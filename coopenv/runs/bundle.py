@@ -85,7 +85,7 @@ class RunRecord:
         self.last = 0
 
     def tick(self, tick: int) -> None:
-        """Keep what belongs to a tick that has been simulated."""
+        """Store the data of a simulated tick."""
         world = self.run.engine.world
         self.last = tick
         if tick % max(1, round(self.run.scenario.rates.camera)) == 0:
@@ -215,7 +215,7 @@ class Bundle:
         return f"{about.environment}, {about.observer}, seed {about.seed}, {about.end.tick} ticks"
 
     def other_versions(self) -> list[str]:
-        """Return what the run was made with and what is different here."""
+        """Return the versions of the run, and their differences here."""
         here, made = versions("coopenv", "numpy", "warp-lang"), self.manifest.versions
         return [f"{name} {made.get(name)}, here {number}" for name, number in here.items() if made.get(name) != number]
 
@@ -260,7 +260,7 @@ class Bundle:
         return differing
 
     def _here(self, reference: str, folder: Path) -> str:
-        """Return where the user's file of a reference is here: code of another place, or other code, does not run."""
+        """Return the path of the user's file of a reference here: code elsewhere, or changed code, does not run."""
         place, colon, name = reference.rpartition(":")
         file = folder.absolute() / Path(place if colon else name).name
         shipped = data_directory("envs") / file.name  # networks, no code

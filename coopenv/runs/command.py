@@ -122,7 +122,7 @@ def execute(
 def _figures_of(
     name: str, overrides: Mapping[str, Any], run: Rollout, whole: Trajectory, steady: float
 ) -> tuple["Results", Observability | None]:
-    """Return what a run with the record `whole` has come to, and its observability where any truth is known."""
+    """Return the results of a run with the record `whole`, and its observability where any truth is known."""
     chosen = whole.with_truth(run.vehicles)
     known, unknown = whole.of_vehicles(chosen).where_truth_is_known(), [i for i in run.vehicles if i not in chosen]
     observability = analyse_observability(known) if chosen else None
@@ -198,7 +198,7 @@ def run(
 
 
 def report(run: Rollout, result: "Results", folder: Path, out: Console) -> None:
-    """Print what `execute` returned for people."""
+    """Print the results of `execute` for people."""
     able, metrics = run.engine.backend.capabilities, result.metrics
     source = f"seed {run.seed}, noise {'on' if run.scenario.noise.enabled else 'off'}"
     done = f"Simulated at {metrics['real_time_factor']:.3g} times real time"

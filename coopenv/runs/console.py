@@ -42,9 +42,9 @@ class Progress:
 
         Args:
             log: console of the line.
-            description: what is done.
+            description: name of the work.
             total: the value of `completed` at the end; None where it is not known.
-            rate: how much is completed in a second where that is known, as in real time (None: as it turns out).
+            rate: amount completed in a second if known, as in real time (None: as measured).
         """
         self._drawn = log.is_terminal and log.file.isatty()  # notebooks ask for colours and are no terminal
         self._log, self._description, self._total, self._completed = log, description, total, 0.0
@@ -93,7 +93,7 @@ class Progress:
         self.update(self._completed + 1.0, description)
 
     def line(self) -> str:
-        """Return how far the work is, e.g. `simulating: 40 % after 20 s, about 30 s left`."""
+        """Return the progress of the work, e.g. `simulating: 40 % after 20 s, about 30 s left`."""
         elapsed, left, share = monotonic() - self._begin, self._left(), self._share
         done = f"{100 * share:.0f} % after " if share else ""
         rest = "" if isnan(left) else f", about {left:.0f} s left"
@@ -140,7 +140,7 @@ def compile_notice(log: Console) -> Iterator[None]:
 
 
 def _compiled_functions() -> int:
-    """Return how many functions Numba has compiled in this process; where nothing needs it, it is not loaded."""
+    """Return the number of functions that Numba has compiled in this process; Numba is not loaded for this."""
     return len(getattr(sys.modules.get("coopenv.estimation.compiled"), "fresh", ()))
 
 
@@ -205,7 +205,7 @@ def estimates_table(vehicles: list[dict[str, Any]]) -> Table:
 
 
 def rates(vehicles: list[dict[str, Any]]) -> Iterator[Table | str]:
-    """Yield the measured rates beside those of the theory and what they mean; nothing where there is no theory."""
+    """Yield the measured rates beside the theory's, and their meaning; nothing without a theory."""
     if all(math.isnan(vehicle["guaranteed_rate_per_s"]) for vehicle in vehicles):
         return
     table = number_table(["rate\nvehicle"], [*RATE_COLUMNS.values()])
@@ -217,7 +217,7 @@ def rates(vehicles: list[dict[str, Any]]) -> Iterator[Table | str]:
 
 
 def legend(steady_from: float, end: float, nees_dof: int) -> Iterator[str]:
-    """Yield what the columns mean, for a steady state that starts at a time and a run that ends at one, s."""
+    """Yield the meaning of the columns, for the start of the steady state and the end of the run, s."""
     yield f"Settles: stays below {SETTLED.text}. Converges: stays below {CONVERGED.text}."
     if steady_from < end:
         yield f"RMSE and NEES: steady state, after {steady_from:g} s. NEES of a consistent estimate: {nees_dof}."
@@ -226,7 +226,7 @@ def legend(steady_from: float, end: float, nees_dof: int) -> Iterator[str]:
 
 
 def gaps(metrics: Mapping[str, Any], judged: int, until: float) -> Iterator[str]:
-    """Yield what a recording lacks: truth, so that `judged` ticks up to a time, s, count, and measurements."""
+    """Yield the gaps of a recording: truth, so that `judged` ticks up to a time, s, count, and measurements."""
     total = metrics.get("ticks", 0) + 1
     if judged < total:
         yield f"Judged at {judged} of {total} ticks, up to {until:g} s: at the others a true pose is not known."
@@ -236,7 +236,7 @@ def gaps(metrics: Mapping[str, Any], judged: int, until: float) -> Iterator[str]
 
 
 def remarks(vehicles: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield what is remarkable: early ends, gaps in observability, mirrored estimates."""
+    """Yield remarks: early ends, gaps in observability, mirrored estimates."""
     for vehicle in vehicles:
         if not math.isnan(vehicle["ended_at_s"]):
             yield f"{vehicle['vehicle']}: {vehicle['outcome']} at {vehicle['ended_at_s']:.2f} s, where its figures end"

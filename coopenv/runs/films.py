@@ -163,7 +163,7 @@ def lost(stage: "Stage", frame: Frame) -> np.ndarray:
 
 
 def frames_at(time: np.ndarray, fps: float, speed: float) -> np.ndarray:
-    """Return which frames, of times (K,) s, a film shows: the last one that is there at each of its pictures."""
+    """Return the indices of the frames, of times (K,) s, in a film: the latest frame at each of its pictures."""
     count = int(np.floor((time[-1] - time[0]) / speed * fps + 1e-6)) + 1
     moments = time[0] + np.arange(count) * speed / fps
     return np.asarray(np.searchsorted(time, moments + 1e-6, side="right") - 1)

@@ -205,12 +205,12 @@ def vehicle_index(scenario: Scenario, name: str | None, driven: bool = False) ->
 
 
 class Reel:
-    """Frames, one after the other; those that have been are kept. Nothing can be changed in those of a kept scene."""
+    """Frames, one after the other; past frames are kept. The frames of a kept scene cannot be changed."""
 
     def __init__(
         self, scenario: Scenario, source: Origin, length: float, coming: Iterable[Frame], abilities: Abilities
     ) -> None:
-        """Begin with none; `length` is that of the episode, s, and `abilities` are what one can do."""
+        """Begin with none; `length` is the episode's, s, and `abilities` are the possible actions."""
         self.scenario, self.source, self.length, self._coming = scenario, source, length, iter(coming)
         self.frames, self.abilities = list[Frame](), abilities
 

@@ -37,10 +37,10 @@ def record(
     on_progress: Callable[[float], None] = lambda share: None,
     on_tick: Callable[[Engine, int], None] = lambda engine, tick: None,
 ) -> Recording:
-    """Drive a backend in float64 to its horizon, or as long as it has ticks, and keep what is sensed.
+    """Drive a backend in float64 to its horizon, or as long as it has ticks, and record the measurements.
 
     Args:
-        source: where the ticks come from: a backend, a scenario as for `coopenv.load_scenario`, or a recording.
+        source: source of ticks: a backend, a scenario as for `coopenv.load_scenario`, or a recording.
         seed: of the episode.
         policy: of driven vehicles: "zero", "random", or what `find_agent` takes.
         on_progress: called with the share of the horizon that is done.
@@ -152,7 +152,7 @@ def drive_vehicles(
         scenario: has acting vehicles.
         policy: chooses for all rows, (world, vehicle).
         seed: of the batch, as of `make_vec(...).reset(seed=...)`.
-        worlds: how many.
+        worlds: number of worlds.
         on_progress: called with the share of the horizon that is done.
 
     Raises:
@@ -202,7 +202,7 @@ def dataset_place(identity: str, root: Path | None, force: bool) -> Path:
     Args:
         identity: `namespace/name-v0`.
         root: folder of datasets; None: Minari's own, the variable MINARI_DATASETS_PATH or ~/.minari/datasets.
-        force: whether it may be there.
+        force: permit an existing one.
 
     Raises:
         CoopenvError: Minari is not installed, or the identity is not one.
@@ -230,11 +230,11 @@ def write_dataset(
 
     Args:
         episodes: in their order.
-        scenario: that they were driven in.
+        scenario: scenario of the episodes.
         name: of the registered environment; empty for another one.
-        place: what `dataset_place` returned.
+        place: the result of `dataset_place`.
         identity: the dataset's.
-        facts: what Minari keeps of algorithm and description.
+        facts: Minari's entries of algorithm and description.
 
     Raises:
         OutputError: it cannot be written.

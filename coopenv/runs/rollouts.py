@@ -1,4 +1,4 @@
-"""Episodes with a driver: stepping, what is kept of them, and their metrics."""
+"""Episodes with a driver: stepping, recording, and metrics."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -50,7 +50,7 @@ class Rollout:
         backend: Backend | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> None:
-        """Build the world; arguments as for `rollout`, but for those of its ticks.
+        """Build the world; arguments as for `rollout`, without the arguments of its ticks.
 
         `backend` is where they come from (None: simulated), and `options` those of its reset.
         """
@@ -60,7 +60,7 @@ class Rollout:
         self.scenario, self.seed = self.engine.backend.scenario, seed
         self.policy = load_policy(policy, scenario, seed)
         self.policy_name = policy if isinstance(policy, str) else getattr(policy, "__name__", "custom")
-        if self.engine.backend.capabilities.recorded:  # whoever drove then
+        if self.engine.backend.capabilities.recorded:  # the driver of the recording
             self.policy_name = "recorded"
         self.ticks_planned = scenario.horizon_ticks
         if steps is not None:
@@ -115,7 +115,7 @@ class Rollout:
         return self._views[name][:, 0]
 
     def trajectory(self) -> Trajectory:
-        """Return what has been recorded so far; `play` must have yielded at least once."""
+        """Return the recording so far; `play` must have yielded at least once."""
         L, recorded = len(self.scenario.landmarks), self._recorded
         rotation_estimate, sight = recorded("estimate_rotation"), recorded("sight")
         moving = [landmark.motion.kind != "static" for landmark in self.scenario.landmarks]
@@ -137,7 +137,7 @@ class Rollout:
         )
 
     def endings(self, vehicles: Sequence[int] | None = None) -> list[Ending]:
-        """Return how the run of each vehicle (None: of those that are estimated here) has ended so far."""
+        """Return the end of each vehicle's run so far (None: of the vehicles that are estimated here)."""
         ended = self._recorded("ended")[:, [*(self.vehicles if vehicles is None else vehicles)]]
         first = np.where(ended.any(axis=0), np.argmax(ended != 0, axis=0), len(ended) - 1)
         words, times = outcome_words(self.scenario), (first / self.scenario.rates.camera).tolist()
@@ -289,7 +289,7 @@ def observability_metrics(observability: Observability, trajectory: Trajectory, 
 
 
 def _parts(gap: tuple[float, float], t: np.ndarray, known: np.ndarray) -> tuple[list[float], list[float]]:
-    """Return where in a gap (s) a vehicle was not known, and where from then on it was; empty where that is nowhere."""
+    """Return the parts of a gap (s) in which a vehicle is unknown, and known again; empty without such parts."""
     start, end = gap
     off = t[(t >= start - 1e-9) & (t <= end + 1e-9) & ~known]
     if not len(off):
@@ -300,7 +300,7 @@ def _parts(gap: tuple[float, float], t: np.ndarray, known: np.ndarray) -> tuple[
 
 
 def outcome_line(run: Rollout) -> str:
-    """Return how the run ended, in words."""
+    """Return the end of the run, in words."""
     outcomes = [ending.outcome for ending in run.endings()]
     counts = {word: outcomes.count(word) for word in outcome_words(run.scenario)[1:]}
     parts = [f"{count} {word}" for word, count in counts.items() if count]

@@ -1,4 +1,4 @@
-"""The setting of a scenario in words: texts, rows of fields, and what is drawn anew in every episode."""
+"""The setting of a scenario in words: texts, rows of fields, and the draws of every episode."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -74,7 +74,7 @@ def lines(*facts: object) -> str:
 
 
 def start(vehicle: Vehicle) -> str:
-    """Return where a vehicle starts, one line per fact."""
+    """Return the start of a vehicle, one line per fact."""
     if isinstance(vehicle.motion, WaypointMotion):
         return vector(vehicle.motion.waypoints[0].position)
     if vehicle.initial_pose is None and not vehicle.routes:
@@ -122,7 +122,7 @@ def motion(moves: Any) -> str:
 
 
 def stages(moves: Any) -> Iterator[tuple[str, str]]:
-    """Yield (time, what happens) of a motion by segments or waypoints, in order; nothing for other motions."""
+    """Yield (time, event) of a motion by segments or waypoints, in order; nothing for other motions."""
     if isinstance(moves, SegmentMotion):
         begin = 0.0
         for segment in moves.segments:

@@ -1,4 +1,4 @@
-"""Scenes of episodes, kept while they run or read from what a run has left; the pages and logs made of them."""
+"""Scenes of episodes, kept while they run or read from the files of a run; the pages and logs made of them."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ class Keeper:
         self._frames: list[Frame] = []
 
     def tick(self, tick: int) -> bool:
-        """Keep what is there at a tick if it is one that is drawn; return whether it is."""
+        """Store the state at a tick if the tick is drawn; return whether it is."""
         drawn = tick % self._stride == 0
         if drawn:
             self._frames.append(Frame.of(self.engine))
         return drawn
 
     def record(self) -> SceneRecord:
-        """Return what has been kept, and what is there now."""
+        """Return the stored frames and the present one."""
         if not self._frames or self.engine.view("tick")[0] > self._frames[-1].tick:
             self._frames.append(Frame.of(self.engine))
         return SceneRecord.of_frames(self.engine.backend.scenario, self._source, self._frames)
@@ -81,7 +81,7 @@ def scene_of(
 
     Args:
         engine: any.
-        source: what the scene is of; its seed is the episode's.
+        source: source of the scene; its seed is the episode's.
         policy: drives (None: action zero).
         on_progress: called with the share that is done.
         longest: length, s, after which the episode is broken off.
@@ -167,7 +167,7 @@ def open_source(
     variant: str | None = None,
     topics: Path | None = None,
 ) -> Backend:
-    """Return where the ticks of a name come from: an environment, a log file, a bag or a data set.
+    """Return the source of ticks of a name: an environment, a log file, a bag or a data set.
 
     Raises:
         CoopenvError: there is no such thing, or it is of a form that cannot be opened.
@@ -178,7 +178,7 @@ def open_source(
 
 
 def title_of(name: str) -> str:
-    """Return what a source is called in headings."""
+    """Return the name of a source in headings."""
     path = Path(name)
     return path.name if kind_of(name) in (SourceKind.LOG, SourceKind.BAG) else path.stem
 
@@ -216,16 +216,16 @@ def observer_of(recording: Recording) -> str:
 
 
 def write_log(recording: Recording, path: Path, log: Console, observer: str | None = None, scene: bool = True) -> None:
-    """Write a recording to a file; with a scene, what Foxglove shows of it and of an observer's estimates.
+    """Write a recording to a file; with a scene, also Foxglove's view of it and of an observer's estimates.
 
     Stamps are those of the wall clock: tick 0 is now.
 
     Args:
-        recording: what is read back.
+        recording: the recording to read back.
         path: of the file.
-        log: where progress is shown.
+        log: console of the progress.
         observer: name, or where its class stands; None: that of the scenario.
-        scene: whether there is anything for viewers but what the recording has.
+        scene: also write data for viewers beyond the recording.
 
     Raises:
         CoopenvError: no such observer, or it fails on the recording, or the file cannot be written.

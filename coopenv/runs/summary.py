@@ -93,7 +93,7 @@ def _gain(value: float | tuple[float, ...] | dict[str, float]) -> str:
 
 
 def _own(scenario: Scenario, part: str) -> str:
-    """Return which vehicles have a camera, noise or limits of their own."""
+    """Return the vehicles that have a camera, noise or limits of their own."""
     names = [name for name, v in zip(scenario.vehicle_names, scenario.vehicles, strict=True) if getattr(v, part)]
     return f"; {listed(names)} with entries of their own" if names else ""
 
@@ -175,7 +175,7 @@ def _end(scenario: Scenario) -> str:
 
 
 def document(name: str, scenario: Scenario) -> dict[str, Any]:
-    """Return what `describe --json` prints: the scenario, and the layout of observation and action."""
+    """Return the output of `describe --json`: the scenario, and the layout of observation and action."""
     layout = observation_layout(scenario)
     return {
         "name": name,

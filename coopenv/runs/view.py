@@ -1,4 +1,4 @@
-"""`coopenv view`: the server and what it shows."""
+"""`coopenv view`: the server and its picture."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -106,7 +106,7 @@ class Viewer:
         return self._reel.frames[self._k]
 
     def _show(self, now: float) -> None:
-        """Send the present frame; who is slow gets the latest one only, since messages replace one another."""
+        """Send the present frame; slow browsers get the latest one only, because messages replace one another."""
         picked = self._look.picked
         with self._server.atomic():
             self._picture.show(self._frame, self.shown if self.playing else None)

@@ -133,7 +133,7 @@ class DrivenMotion(Section):
     initial_speed: Number = 0.0
     """m/s"""
     initial_speed_spread: NonNegative = 0.0
-    """Half-width of a uniform deviation of it, m/s; what comes out is kept within what `[dynamics]` permits."""
+    """Half-width of a uniform deviation of it, m/s; the result is clipped to the limits of `[dynamics]`."""
 
 
 class TrafficMotion(Section):
@@ -201,7 +201,7 @@ class InitialEstimate(Section):
     def _true_position(cls, value: Any) -> Any:
         if value is True:
             return None
-        return tuple(value) if isinstance(value, list) else value  # what a validator returns is no JSON any more
+        return tuple(value) if isinstance(value, list) else value  # a validator's result is no JSON any more
 
     _one_orientation = model_validator(mode="after")(_has_one_orientation)
 
@@ -233,7 +233,7 @@ class Landmark(Section):
     """Orientation of a moving landmark's body at t = 0, rad."""
     motion: LandmarkMotion = StaticMotion()
     body: Body | None = None
-    """A landmark with a body occludes what is behind it."""
+    """A landmark with a body occludes targets behind it."""
     marker: Vector3 = (0.0, 0.0, 0.0)
     """The point that cameras see, in the landmark's body frame, m."""
 
@@ -269,7 +269,7 @@ class Vehicle(Section):
     routes: tuple[str, ...] = Field(default=(), max_length=1000)
     """Names of routes, one of which is drawn at each reset: the vehicle starts at its beginning and goes to its end."""
     camera: Camera | None = None
-    """This vehicle's own; what it does not give is as in the scenario's [camera]. Likewise the next three."""
+    """The vehicle's own settings; settings left out are the scenario's [camera]. Likewise the next three."""
     noise: Noise | None = None
     dynamics: Dynamics | None = None
     faults: Faults | None = None
@@ -281,7 +281,7 @@ class Vehicle(Section):
 
     @field_serializer("camera", "noise", "dynamics", "faults")
     def _given(self, part: Section | None) -> dict[str, Any] | None:
-        """Leave out what is the scenario's."""
+        """Omit the scenario's settings."""
         return None if part is None else part.model_dump(exclude_unset=True)
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Sections of the programs that may move the vehicles in place of coopenv, and what a scenario takes from SUMO's files.
+"""Sections of the programs that may move the vehicles in place of coopenv, and the content of SUMO's files.
 
 See docs/backends.md. Formats of SUMO: https://sumo.dlr.de/docs/Networks/SUMO_Road_Networks.html and
 https://sumo.dlr.de/docs/Simulation/Shapes.html. Coordinates are SUMO's, m; heights are not read.
@@ -39,7 +39,7 @@ class Cosimulator(Section):
     """True if its vehicles' reference point is midway between the axles instead of on the rear axle."""
 
     most_vehicles: int = Field(default=40, ge=0, le=10_000)
-    """Vehicles on its road at most, besides those of this file: the traffic that only occludes and collides."""
+    """Largest number of vehicles on its road besides this file's: traffic that only occludes and collides."""
 
     @property
     def roads(self) -> str:
@@ -74,7 +74,7 @@ class Sumo(Cosimulator):
     program = "coopenv.backends.sumo:SumoProgram"
 
     most_vehicles: int = Field(default=1_000, ge=0, le=10_000)
-    """Vehicles on its road at most, besides those of this file: the traffic that only occludes and collides."""
+    """Largest number of vehicles on its road besides this file's: traffic that only occludes and collides."""
     net: File
     """Network (`.net.xml`, as of netconvert or netgenerate)."""
     routes: tuple[File, ...] = Field(default=(), max_length=100)
@@ -94,7 +94,7 @@ class Sumo(Cosimulator):
     building_height: Positive = 10.0
     """m"""
     options: dict[str, Setting] = Field(default={})
-    """SUMO's own options by name; those that follow from settings of this file are not repeated here."""
+    """SUMO's own options by name, without options that follow from settings of this file."""
     included: bool = False
     """True if this file contains the roads, landmarks, buildings and routes of SUMO's files; written by coopenv."""
 
@@ -237,7 +237,7 @@ def _elements(path: Path) -> Iterator[Element]:
 
 @contextmanager
 def _reading(path: Path, key: str) -> Iterator[None]:
-    """Turn what goes wrong with a file into a `ScenarioError` that names the key and the file."""
+    """Turn an error of a file into a `ScenarioError` that names the key and the file."""
     try:
         yield
     except OSError as error:

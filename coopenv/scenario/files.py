@@ -101,7 +101,7 @@ def _data(value: Any) -> Any:
 
 
 def scenario_name(name_or_path: ScenarioLike) -> str:
-    """Return what results call a scenario: the stem of its file, the name of a scene; without these its title."""
+    """Return the name of a scenario in results: the stem of its file, the name of a scene; without these its title."""
     if isinstance(name_or_path, str | Path):
         return Path(name_or_path).stem
     title = name_or_path.title if isinstance(name_or_path, Scenario) else name_or_path.get("title", "scenario")
@@ -171,7 +171,7 @@ def merged(under: Any, over: Any) -> Any:
 
 
 def override(raw: Any, overrides: Mapping[str, Any]) -> None:
-    """Set dotted keys in nested plain data, in place; a table is merged into the one that is there."""
+    """Set dotted keys in nested plain data, in place; a table is merged into an existing one."""
     for key, value in overrides.items():
         _descend(raw, str(key).split("."), value, str(key))
 

@@ -32,7 +32,7 @@ class Observation(Section):
     include: tuple[str, ...] = Field(default=USUAL_GROUPS, min_length=1, json_schema_extra=_list_groups)
     """Groups of coopenv's fields, and names of single fields: coopenv's, registered and custom ones."""
     exclude: tuple[str, ...] = Field(default=(), json_schema_extra=_list_groups)
-    """Groups and fields that are left out of those again, for what an ablation does without."""
+    """Groups and fields that are removed again, for an ablation."""
     planar: bool = False
     """Omit heights, roll and pitch, which a vehicle on a plane cannot change."""
     position_scale: Positive = 50.0
@@ -46,7 +46,7 @@ class Observation(Section):
     map_scale: Positive = 10.0
     """m, of landmarks of the map"""
     map_size: int = Field(default=8, ge=1, le=256)
-    """Landmarks of the map of the fields per landmark: those nearest by the vehicle's own estimate."""
+    """Number of map landmarks in the fields per landmark: the nearest to the vehicle's own estimate."""
     route_step: Positive = 0.5
     """m; `route_ahead` shows the way so far ahead, and twice, four and eight times as far"""
     scales: dict[str, Positive] = Field(default={})
@@ -165,13 +165,13 @@ class Reward(Section):
     own_share: Probability = 0.0
     """Share of a vehicle's own weighted sum in its reward with a team; the rest is the team's."""
     uncertainty_threshold: NonNegative = 0.02
-    """m; terms per metre count what is above it"""
+    """Threshold, m; terms per metre count the excess"""
     uncertainty_cap: Positive = 1.0
-    """m; and at most this, which is also the price of a metre that is never driven"""
+    """Largest counted excess, m; also the price of a metre that is never driven"""
     observability_floor: Positive = 1e-5
-    """Added to the smallest eigenvalue of the sliding Gramian before the logarithm: above what rounding makes of 0"""
+    """Addition to the smallest eigenvalue of the sliding Gramian before the logarithm: above the rounding of 0"""
     observability_level: Number = -1.0
-    """log10 of what the smallest eigenvalue should be"""
+    """log10 of the desired smallest eigenvalue"""
     custom: dict[Annotated[str, AfterValidator(REWARD_TERMS.free)], Term] = Field(default={})
     """Terms of one's own by name: where their functions stand, see docs/terms.md."""
     privileged: bool = False
@@ -179,7 +179,7 @@ class Reward(Section):
 
     @property
     def by_name(self) -> dict[str, float]:
-        """The weight of every term that is computed: coopenv's, custom ones, and those weighed, in this order."""
+        """The weight of every computed term: built-in, custom and weighed terms, in this order."""
         named: dict[str, float] = self.weights.model_dump()
         return {**dict.fromkeys((*REWARD_TERMS.built_in, *self.custom), 0.0), **named}
 
@@ -291,7 +291,7 @@ class Randomisation(_Factors):
 
 
 class Difficulty(_Factors):
-    """Factors [at difficulty 0, at difficulty 1], straight between; those that are drawn multiply them."""
+    """Factors [at difficulty 0, at difficulty 1], linear between; drawn factors multiply them."""
 
     level: Annotated[float, Field(ge=0.0, le=1.0)] | Literal["easy", "normal", "hard"] = 0.5
     """Default of the options of a reset; `easy` is 0, `normal` 0.5, `hard` 1."""

@@ -89,7 +89,7 @@ def register_observation(
             vehicle; "landmark": one for each of the landmarks of the map that are nearest by the vehicle's estimate.
         size: entries of one value.
         unit: of the value.
-        scale: what the value is divided by: a number, or the name of a scale of `[observation]`.
+        scale: divisor of the value: a number, or the name of a scale of `[observation]`.
         low: -1, or 0 for what is never negative: the lower end of the range.
         center: the value that reads 0.
         meaning: one line for tables; empty: the first line of the function's docstring.
@@ -118,7 +118,7 @@ def _register(
 
 
 def record_count(where: str, function: Any, allowed: tuple[int, ...]) -> int:
-    """Return how many records the function of a term takes.
+    """Return the number of records that the function of a term takes.
 
     Args:
         where: begins an error.

@@ -121,7 +121,7 @@ def route_length(route: Route) -> float:
 
 
 def point_count(route: Route) -> int:
-    """Return how many points describe a route; those of a straight line are its ends."""
+    """Return the number of points of a route; a straight line has its two ends."""
     straight = route.wander == 0.0 and not route.shape.turn.any()
     return 2 if straight else min(MOST_POINTS, math.ceil(route_length(route) / SPACING) + 1)
 

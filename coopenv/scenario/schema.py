@@ -192,7 +192,7 @@ class Scenario(Section, metaclass=_Loaded):
 
     @property
     def replay_ticks(self) -> int:
-        """The most ticks that a replayed message may be old beyond what the radio takes, over all vehicles."""
+        """Largest age (ticks) of a replayed message beyond the radio's delay, over all vehicles."""
         lies = [faults.lie for faults in self.all_faults]
         return max(self.ticks_of_replay(lie.age) if lie.kind == "replay" else 0 for lie in lies)
 
@@ -252,7 +252,7 @@ def _twice(named: Sequence[Any]) -> list[str]:
 
 
 def _misplaced(s: Scenario) -> Iterator[str]:
-    """Yield what does not fit to what moves the vehicles."""
+    """Yield the conflicts with the simulator of the vehicles."""
     for name in COSIMULATORS:
         if (getattr(s, name) is None) == (s.backend == name):
             yield f"{name}: needed" if s.backend == name else f'{name}: only with backend = "{name}"'
@@ -281,7 +281,7 @@ def _moved_here(vehicle: Vehicle) -> Iterator[str]:
 
 
 def _problems(s: Scenario) -> Iterator[str]:
-    """Yield what of one section does not fit to another."""
+    """Yield the conflicts between sections."""
     k, q, targets = s.observer.k, s.observer.q, s.target_names
     if isinstance(k, tuple) and len(k) != len(s.vehicles):
         yield f"observer.k: {len(k)} values for {len(s.vehicles)} vehicles"
@@ -312,7 +312,7 @@ def _problems(s: Scenario) -> Iterator[str]:
 
 
 def _problems_of_nearby(s: Scenario) -> Iterator[str]:
-    """Yield why what is in range of a vehicle is not limited."""
+    """Yield the reasons for which the agents in range of a vehicle are not limited."""
     key, listed = "topology.most_nearby", [vehicle.neighbours for vehicle in s.vehicles]
     if s.action.radio or "seen" in s.observation.include:
         yield f"action.radio, observation.include: neither a radio action nor 'seen' with {key}"
@@ -331,7 +331,7 @@ def _problems_of_nearby(s: Scenario) -> Iterator[str]:
 
 
 def _problems_of_driving(s: Scenario) -> Iterator[str]:
-    """Yield what of action and reward does not fit to the vehicles, and what is beyond their own limits."""
+    """Yield the conflicts of action and reward with the vehicles, and values beyond their limits."""
     driven = sum(vehicle.motion.kind == "driven" for vehicle in s.vehicles)
     if s.reward.team != "own" and driven < 2:
         yield f"reward.team: '{s.reward.team}' needs at least two driven vehicles, got {driven}"

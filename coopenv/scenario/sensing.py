@@ -96,7 +96,7 @@ class Camera(Section):
     extrinsics_position_error: NonNegative = 0.0
     """Likewise of where the optical centre is, per axis, m."""
     focal_length_error: NonNegative = 0.0
-    """Standard deviation of e: the true focal length is (1 + e) times what observers know, so that the coordinates of a
+    """Standard deviation of e: the true focal length is (1 + e) times the known one, so that the coordinates of a
     bearing on the image plane (at distance 1) are (1 + e) times what they should be; drawn per vehicle and episode."""
 
     def to_body(self, pan: float = 0.0) -> np.ndarray:
@@ -149,7 +149,7 @@ class BearingNoise(Section):
 
 
 class Slip(Section):
-    """Wheels that slip now and then, so that the odometry reads what the body does not do. Off unless `rate` is set."""
+    """Occasional slip of the wheels, so that the odometry differs from the body's motion. Off unless `rate` is set."""
 
     rate: NonNegative = 0.0
     """Slips begin so often, 1/s."""
@@ -196,7 +196,7 @@ class Topology(Section):
     """Targets that a vehicle measures, and senders that it receives."""
 
     mode: Literal["fixed", "sensed"] = "fixed"
-    """`fixed`: every neighbour at every tick; `sensed`: those in the field of view and not occluded."""
+    """`fixed`: every neighbour at every tick; `sensed`: neighbours in the field of view that are not occluded."""
     acyclic: bool = True
     """Restrict to the directed acyclic leader-follower order of the paper's Assumption 1."""
     most_nearby: int | None = Field(default=None, ge=1, le=4_096)
@@ -352,7 +352,7 @@ class Faults(Section):
     """Faults of a vehicle's computer, clock, map and messages."""
 
     clock_offset: NonNegative = 0.0
-    """Standard deviation of what the vehicle's clock is off by, s. Messages seem older or newer by the difference of
+    """Standard deviation of the vehicle's clock offset, s. Messages seem older or newer by the difference of
     the sender's clock and the receiver's, to whole camera ticks, but never from the future."""
     restart: Restart = Restart()
     corruption: Corruption = Corruption()

@@ -1,4 +1,4 @@
-"""Sites: what stands around the vehicles of parametric scenes, and the grid of streets of scenario files.
+"""Sites: surroundings of the vehicles of parametric scenes, and the grid of streets of scenario files.
 
 On the roads of scenes vehicles keep their speed and measure what is in range and not occluded: landmarks, and the
 vehicles before them. Cars and vans have bodies that occlude. In a scenario file the table `streets` stands for roads,

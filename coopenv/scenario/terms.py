@@ -1,4 +1,4 @@
-"""Terms: what an observation holds, what a reward weighs, what ends a vehicle's episode; a row each.
+"""Terms of observations, rewards and ends of episodes; a row each.
 
 A row describes a term and names the function that computes it. From the rows come the layout of an observation, the
 weights that a scenario may set, the kernel (`coopenv.api.terms`), and the tables of `coopenv describe`.

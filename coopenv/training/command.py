@@ -110,13 +110,13 @@ def train(
     is finished the agent takes the checkpoint's place, at once and as a whole.
 
     Args:
-        plan: what to train.
+        plan: the plan of the training.
         out: the agent's folder.
         resume: go on from the folder's checkpoint, which is of the same plan, and with the outputs that it began with.
         threads: shares of the batch on the CPU; results do not depend on it.
         onnx: also write an ONNX model.
         logs: folder for TensorBoard.
-        force: let the new agent, once it is finished, take the place of one that is there.
+        force: let the finished agent replace an existing one.
         reports: callbacks.
 
     Returns:
@@ -197,7 +197,7 @@ def _learn(
 
 
 def _judge(trainer: Trainer | SetTrainer, threads: int | None, report: Reports, seeds: list[int]) -> list[Result]:
-    """Return how the mean action drives in held-out worlds."""
+    """Return the figures of the mean action in held-out worlds."""
     with closing(Engine(trainer.scenario, len(seeds), threads=threads)) as engine:
         results = score(drive(engine, trainer.mean_action, seeds))
     report.judged(trainer.status.steps, results)

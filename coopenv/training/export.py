@@ -159,7 +159,7 @@ def _card(trainer: Trainer | SetTrainer, environment: EnvironmentFile, results: 
 
 
 def _figures(results: Sequence[Result]) -> dict[str, dict[str, float]]:
-    """Return what is known of figures on held-out maps, with their intervals, by name; `n` worlds each."""
+    """Return the known figures on held-out maps, with their intervals, by name; `n` worlds each."""
     return {
         result.metric: {
             **{key: round(getattr(result, key), 5) for key in ("mean", "ci_low", "ci_high")},

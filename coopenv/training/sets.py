@@ -48,13 +48,13 @@ class SetNetwork(nn.Module):
 
 
 class SetTrainer:
-    """A clone in the worlds of many environments, and what its agent's folder is written from."""
+    """A clone in the worlds of many environments, and the data of its agent's folder."""
 
     def __init__(self, plan: TrainingPlan, scenario: Scenario, clone: Clone, threads: int | None = None) -> None:
-        """Note what is to be done.
+        """Store the plan.
 
         Args:
-            plan: what to train.
+            plan: the plan of the training.
             scenario: of the environment that it is judged in.
             clone: the settings of the clone.
             threads: shares of the batch on the CPU.

@@ -1,4 +1,4 @@
-"""The settings of a training, read from a TOML file, what exactly is to be trained, and these files beside an agent."""
+"""The settings of a training, read from a TOML file, its plan, and the files of both beside an agent."""
 
 import ast
 import json
@@ -205,7 +205,7 @@ class TrainingPlan:
 
 
 def _meaning(scenario: Scenario) -> dict[str, object]:
-    """Return by name what says what the entries of observations and actions mean."""
+    """Return by name the settings that define the entries of observations and actions."""
     layout = observation_layout(scenario)
     return {
         **layout,

@@ -80,7 +80,7 @@ class Watch(BaseCallback):
             self.logger.record(f"reward_terms/{name}", float(mean))
 
     def figures(self) -> dict[str, float]:
-        """Return what `Status` holds."""
+        """Return the figures of a `Status`."""
         found: dict[str, float] = {}
         errors = np.concatenate(self._errors) if self._errors else np.empty(0)
         if errors.size:
@@ -99,11 +99,11 @@ class Watch(BaseCallback):
 APART = 1_000_003
 """Between the seeds of parts of a batch."""
 LEAST_VARIANCE = 1e-4
-"""Added to variances: what hardly ever changes is not blown up to the size of the rest."""
+"""Addition to variances, so that nearly constant entries are not scaled up to the size of the rest."""
 
 
 class MixedWorlds(CooperativeSB3VecEnv):
-    """Batches whose worlds differ in what they draw, or in their sensors, one below the other as one."""
+    """Batches of worlds with different draws or sensors, stacked as one batch."""
 
     def __init__(self, parts: Sequence[CooperativeSB3VecEnv]) -> None:
         super().__init__(parts[0].envs)
@@ -139,7 +139,7 @@ class MixedWorlds(CooperativeSB3VecEnv):
         return {f"{place}/{name}": values for place, state in states for name, values in state.items()}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Go on from what `get_state` returned. Raises CoopenvError: it does not fit."""
+        """Continue from a state of `get_state`. Raises CoopenvError: it does not fit."""
         states: list[dict[str, np.ndarray]] = [{} for _ in self.parts]
         for name, values in state.items():
             place, _, own = name.partition("/")
@@ -305,7 +305,7 @@ class Trainer:
         """Build worlds and networks.
 
         Args:
-            plan: what to train.
+            plan: the plan of the training.
             scenario: of the environment, the plan's overrides applied.
             threads: shares of the batch on the CPU.
         """

@@ -190,7 +190,7 @@ def consistency_figure(
         steady_from: s; the mean NEES and the share inside are over the ticks after it (None: `STEADY_SHARE` of
             the record).
         width: inches (None: a page's).
-        gain: whether P is the gain matrix of an observer that states no covariance, which the figure then says.
+        gain: P is the gain matrix of an observer that states no covariance; the figure notes it.
     """
     if steady_from is None:
         steady_from = STEADY_SHARE * float(trajectory.t[-1])

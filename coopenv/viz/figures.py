@@ -274,7 +274,7 @@ def save_figures(
 
     Args:
         trajectory: the record of a run.
-        directory: where the files go; files of the same names are replaced.
+        directory: folder of the files; files of the same names are replaced.
         observability: with the default window and threshold unless given.
         file_format: one of `FORMATS`.
         note: in small print below each figure: its subject.
@@ -318,7 +318,7 @@ def draw_figure(
         ends: s, when each vehicle arrived or collided and was parked, where its lines stop (None: no vehicle was).
         steady_from: s, start of the steady state that mean NEES are over (None: at 70 % of the record).
         width: a column of `coopenv.viz.figures.COLUMNS`, whose fonts the figure then has, or inches (None: a page's).
-        gain: whether P is a gain matrix and no covariance.
+        gain: P is a gain matrix and no covariance.
         note: in small print below the figure: its subject.
 
     Raises:

@@ -66,7 +66,7 @@ class RunView:
     """
 
     def __init__(self, recording: Recording, run: Run, clock: LogClock, gain: bool) -> None:
-        """Take what is shown; with `gain` the observer's P is a gain matrix, and no covariance."""
+        """Set the source; with `gain` the observer's P is a gain matrix, and no covariance."""
         r, self.recording, self.run, self.clock, self.gain = recording, recording, run, clock, gain
         self.ticks = range(0, r.ticks, max(1, round(1.0 / (_RATE * r.dt))))
         """Ticks to show, at most 20 a second."""
@@ -128,7 +128,7 @@ def topics(view: RunView) -> list[View]:
 
 
 def _world(view: RunView, k: int) -> Any:
-    """Return what never moves."""
+    """Return the static scene."""
     scenario, entities = view.recording.scenario, []
     if scenario is not None:
         stage = Stage(scenario)

@@ -107,7 +107,7 @@ def quad(corners: np.ndarray, z: float) -> Mesh:
 
 @dataclass
 class Look:
-    """Choices of whoever looks, and measures that follow from the scene's size."""
+    """Choices of the viewer, and measures that follow from the scene's size."""
 
     magnification: float = 1.0
     """Magnification of the ellipsoids."""
@@ -218,7 +218,7 @@ class Segments:
         self._thickness, self._room = thickness, 0
 
     def show(self, segments: Coloured) -> None:
-        """Show segments; those with NaN are left out."""
+        """Show segments; segments with NaN are left out."""
         points, colours = fine(segments[0], self._step), segments[1]
         good = np.isfinite(points).all(axis=(1, 2))
         points, colours = points[good], colours[good]

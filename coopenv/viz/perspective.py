@@ -346,7 +346,7 @@ class View3d:
         return np.array([_affine(*each) for each in zip(R, center, self._size, strict=True)])
 
     def _place_ellipses(self, frame: Frame, estimate: np.ndarray) -> None:
-        """Place the 3-sigma ellipses on the ground, but for large ones and those of a gain matrix."""
+        """Place the 3-sigma ellipses on the ground, but for large ones and ellipses of a gain matrix."""
         semi, axes = semi_axes(frame.position_covariance[:, :2, :2])
         drawn = self._honest & (semi[:, 1] <= _LARGEST * self._stage.side)
         for i, actor in enumerate(self._ellipses):
@@ -381,7 +381,7 @@ class View3d:
         self._draw_lines("sight", np.stack(ends, axis=1), observer, 1.0, opacity=0.45)
 
     def _draw_lines(self, name: str, segments: np.ndarray, vehicle: np.ndarray, width: float, **more: Any) -> None:
-        """Draw line segments (K, 2, 3) of vehicles (K,) in their colours; those with NaN are left out."""
+        """Draw line segments (K, 2, 3) of vehicles (K,) in their colours; segments with NaN are left out."""
         good = np.isfinite(segments).all(axis=(1, 2))
         self._plot.remove_actor(name, render=False)
         if good.any():

@@ -126,7 +126,7 @@ def entries(start: np.ndarray, path: np.ndarray, boxes: Sequence[Box]) -> np.nda
 
 
 def free_lengths(origin: np.ndarray, rays: np.ndarray, reach: np.ndarray | float, boxes: Sequence[Box]) -> np.ndarray:
-    """Return how far rays (N, K, 3) from cameras (N, 3) get before a box stops them, (N, K) m, up to `reach`.
+    """Return the lengths (N, K), m, of rays (N, K, 3) from cameras (N, 3) up to the first box or `reach`.
 
     `reach` is one for all, or (N,) of each camera. Rays are unit vectors in the map frame.
     """
@@ -280,7 +280,7 @@ class Stage:
         return np.asarray(middle + (points - middle) * np.minimum(1.0, sides * self.side / np.maximum(away, 1e-9)))
 
     def eyes(self, frame: Frame) -> np.ndarray:
-        """Return where cameras are, (N, 3)."""
+        """Return the positions (N, 3) of cameras."""
         return np.asarray(frame.vehicle_position + (frame.vehicle_rotation @ self.camera[..., None])[..., 0])
 
     def targets(self, frame: Frame) -> np.ndarray:

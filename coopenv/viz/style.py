@@ -69,7 +69,7 @@ def save(figure: Figure, path: Path, file_format: str = "", about: Mapping[str, 
         figure: any.
         path: an older file is replaced.
         file_format: one of `FORMATS`.
-        about: what the file's metadata say of it, for example environment, observer and seed.
+        about: metadata of the file, for example environment, observer and seed.
 
     Raises:
         CoopenvError: no such format, or the file cannot be written; an older one is untouched.
@@ -85,7 +85,7 @@ def save(figure: Figure, path: Path, file_format: str = "", about: Mapping[str, 
 
 
 def sign(figure: Figure, note: str) -> None:
-    """Write a note in small print below a figure, and below what is there already."""
+    """Write a note in small print below a figure and earlier notes."""
     if note:
         above = figure.get_supxlabel()
         words = f"{above}\n{note}" if above else note
@@ -99,7 +99,7 @@ def _grow(figure: Figure, lines: int) -> None:
 
 
 def explain(figure: Figure, text: str) -> None:
-    """Write in small print below a figure what it means, on as many lines as it takes."""
+    """Write the legend in small print below a figure, on as many lines as needed."""
     sign(figure, fill(text, int(figure.get_figwidth() / LETTER)))
 
 
@@ -161,7 +161,7 @@ def draw_band(ax: Axes, t: np.ndarray, values: np.ndarray, bins: int, **look: An
 
 
 def bins_of(inches: float) -> int:
-    """Return how many stretches a panel of a width is divided into."""
+    """Return the number of intervals of a panel of a width."""
     return max(20, int(inches / BIN))
 
 
@@ -243,7 +243,7 @@ def canvas(width: float | None, height: float, note: str = "") -> tuple[Figure, 
 
 
 def fitting(width: float, each: float, most: int) -> int:
-    """Return how many panels of a width stand side by side."""
+    """Return the number of panels of a width side by side."""
     return int(min(most, width / each)) if width >= each else 1
 
 
@@ -257,7 +257,7 @@ def marks(*entries: tuple[object, str, Mapping[str, Any]]) -> list[Line2D | Patc
 
 
 def mark_look(marker: str, edge: str, face: str, size: float = 6.0, rim: float = 1.0) -> dict[str, Any]:
-    """Return how a mark of a point looks, as a line without a stroke; sizes in pt."""
+    """Return the style of a point's mark, as a line without a stroke; sizes in pt."""
     look = {"marker": marker, "markeredgecolor": edge, "markerfacecolor": face}
     return {"linestyle": "none", "markersize": size, "markeredgewidth": rim, **look}
 
@@ -274,12 +274,12 @@ def legend_above(figure: Figure, handles: Sequence[Artist]) -> None:
 
 
 def shown_length(text: str) -> int:
-    """Return how many characters of a text are seen, its formulas counted by their letters."""
+    """Return the number of visible characters of a text, its formulas counted by their letters."""
     return len(re.sub(r"[${}_^\\]", "", text))
 
 
 def _columns_width(lengths: Sequence[float], columns: int) -> float:
-    """Return how wide columns are in which entries stand below one another; the first ones may hold one more."""
+    """Return the widths of columns of entries; the first columns may hold one entry more."""
     rows = np.array_split(np.array(lengths), columns)
     return float(sum(column.max(initial=0.0) for column in rows))
 

@@ -182,7 +182,7 @@ class TopView:
         self._goals.add_names(self._axes, layers, landmarks)
         look: dict[str, Any] = {"fontsize": NORMAL, "weight": "bold", "color": INK, "path_effects": ground.HALO}
         look |= {"ha": "center", "va": "center", "clip_on": True}
-        named = range(ground.MOST_ROWS)  # those of the table: more names would overlap
+        named = range(ground.MOST_ROWS)  # vehicles of the table: more names would overlap
         marks = (geometry.vehicle_mark(i) if i in named else "" for i in range(len(colours)))
         self._names = [layers.keep(self._axes.text(0, 0, mark, **look)) for mark in marks]
         boxes = [name.get_window_extent() for name in self._names]

@@ -58,7 +58,7 @@ SIGHT_LOOKS: dict[Sight, dict[str, object]] = {
     Sight.OCCLUDED_BY_BUILDING: {"linewidth": 0.9, "linestyle": DASHED, "color": GREY},
     Sight.OCCLUDED_BY_BODY: {"linewidth": 1.1, "linestyle": DASHED, "color": INK},
 }
-"""Lines of sight; those without a colour have their observer's."""
+"""Lines of sight; lines without a colour have their observer's."""
 
 
 def pixels(x: float, y: float) -> tuple[float, float]:
@@ -192,7 +192,7 @@ _MOST_NAMES = 3  # that stand for goals which touch one another; of the others t
 
 
 class Goals:
-    """The goals of all vehicles, and the routes of those that have drawn one."""
+    """The goals of all vehicles, and the routes that vehicles have drawn."""
 
     def __init__(self, scenario: Scenario, layers: Layers) -> None:
         """Add all but the names."""

@@ -229,7 +229,7 @@ def _scene(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
 def _draw_paths(
     drawing: Drawing, trajectory: Trajectory, ends: Sequence[float] | None, scenario: Scenario | None
 ) -> list[Line2D | Patch]:
-    """Draw landmarks, estimates, and the truth on top; return what the legend explains.
+    """Draw landmarks, estimates, and the truth on top; return the entries of the legend.
 
     A scenario's vehicles that the record is not about are estimated elsewhere.
     """

@@ -66,7 +66,7 @@ class Actors:
         self._traffic: MeshNode | None = None
 
     def set_source(self, source: Origin) -> None:
-        """Set the source: ellipsoids of a gain matrix are paler than those of a covariance."""
+        """Set the source: ellipsoids of a gain matrix are paler than ellipsoids of a covariance."""
         self._ellipsoids.handle.opacity = _HONEST if source.honest else _GAIN
 
     def place(self, frame: Frame, look: Look) -> None:
@@ -150,7 +150,7 @@ def sight_lines(stage: Stage, frame: Frame, colours: np.ndarray, look: Look) -> 
 
 
 def stopped(start: np.ndarray, end: np.ndarray, boxes: list[Box]) -> np.ndarray:
-    """Return where paths from start to end (K, 3) first enter a box in which they do not start; else their ends."""
+    """Return the first entries of paths (start to end, (K, 3)) into a box that they start outside; else the ends."""
     enter = entries(start, end - start, boxes)
     share = np.where(enter > 1e-6, enter, np.inf).min(axis=0, initial=1.0)
     return np.asarray(start + share[:, None] * (end - start))
@@ -252,7 +252,7 @@ _MOST_NAMES = 24  # landmarks; more would hide one another
 
 
 def in_turn(turn: int | None, count: int) -> slice:
-    """Return which of so many names, or fields of view, are sent in a turn: half, at most four; None: all of them."""
+    """Return the indices of the names, or fields of view, that are sent in a turn: half, at most four; None: all."""
     parts = max(2, -(-count // _AT_ONCE))
     return slice(None) if turn is None else slice(turn % parts, None, parts)
 
@@ -279,7 +279,7 @@ class Labels:
         }
 
     def place(self, frame: Frame, time: float, look: Look, turn: int | None = None) -> None:
-        """Move the names; with a `turn` those of some vehicles, as in `Picture.show`."""
+        """Move the names; with a `turn` the names of some vehicles, as in `Picture.show`."""
         stage, side, shown = self._stage, self._stage.side, look.names
         if turn is None or not 0.0 <= time - self._said < _OFTEN - 1e-9:
             self._said = time
@@ -290,7 +290,7 @@ class Labels:
         places, estimates = frame.vehicle_position + above, frame.estimate_position + above
         places[:, 2] += _RAISED * side * levels(places[:, :2], _CLOSE * side)
         inside = np.all((estimates[:, :2] > stage.low) & (estimates[:, :2] < stage.high), axis=-1)
-        named = inside & (frame.position_error > _APART * side)  # those that are not where their vehicles are
+        named = inside & (frame.position_error > _APART * side)  # estimates away from their vehicles
         for i in range(stage.vehicles)[mine]:
             _put(self._cars[i], places[i], shown)
             _put(self._estimates[i], estimates[i], shown and bool(named[i]))
@@ -399,7 +399,7 @@ class Picture:
 
 
 def first_camera(stage: Stage, aspect: float = 1.6) -> tuple[np.ndarray, np.ndarray]:
-    """Return where the first camera is and what it looks at, (3,) each; from the south, the whole square in sight."""
+    """Return the position and the target of the first camera, (3,) each; from the south, the whole square in sight."""
     direction = np.array([-0.12, -0.72, 0.85])
     half = np.tan(FIELD_OF_VIEW / 2) * min(1.0, aspect)
     distance = 0.52 * stage.side / half

@@ -339,7 +339,7 @@ def follower_of(model: Any, state: Any, world: int, vehicle: int, p: Any, last: 
 
 @device_function
 def nearest_in_grid(model: Any, state: Any, world: int, vehicle: int, p: Any, last: Any, best: Any) -> MapLandmark:
-    """Return what `next_landmark` looks for, from the grid; -1 if its rings of cells about the estimate do not hold it.
+    """Return the next landmark for `next_landmark`, from the grid; -1 if the rings of cells about the estimate lack it.
 
     All that is nearer to p than r cells is in the rings up to r, and what is behind `last` not within its distance.
     """

@@ -30,10 +30,10 @@ class Field:
     shape: tuple[int, ...]  # of its values
     group: str  # of `observation.include`
     unit: str  # of its values, center and scale
-    scale: float  # what a value is divided by, in its unit
+    scale: float  # divisor of a value, in its unit
     low: float  # -1, or 0 where a value cannot be negative
     meaning: str  # in words
-    center: float = 0.0  # what is subtracted before, in its unit
+    center: float = 0.0  # subtracted before, in its unit
 
     @property
     def slice(self) -> slice:
@@ -52,8 +52,8 @@ class ActionField:
 
     name: str  # of what is commanded
     unit: str  # of low and high
-    low: float  # what -1 asks for
-    high: float  # what 1 asks for
+    low: float  # value of -1
+    high: float  # value of 1
 
     def level(self, value: Any) -> Any:
         """Return the entry of an action for values in the unit of the field; beyond [-1, 1] if out of reach."""
@@ -61,7 +61,7 @@ class ActionField:
 
 
 class Layout(dict[str, Field]):
-    """The fields of the flat observation by name, in their order, and those of the actions."""
+    """The fields of the flat observation by name, in their order, and the fields of the actions."""
 
     def __init__(self, fields: Mapping[str, Field], actions: tuple[tuple[ActionField, ...], ...]) -> None:
         super().__init__(fields)
@@ -109,7 +109,7 @@ def included_fields(scenario: Scenario) -> dict[str, ObservationField]:
 
 
 def entries_of(row: ObservationField, scenario: Scenario) -> tuple[int, ...]:
-    """Return which entries of a field's value a scenario's observation holds."""
+    """Return the entries of a field's value that a scenario's observation holds."""
     if row is OBSERVATION_FIELDS.built_in["last_action"]:
         return tuple(range(2 if scenario.action.pan is None else 3))
     if scenario.observation.planar and row.planar is not None:
@@ -118,7 +118,7 @@ def entries_of(row: ObservationField, scenario: Scenario) -> tuple[int, ...]:
 
 
 def row_counts(scenario: Scenario) -> dict[str, int]:
-    """Return how many rows an observation has of the records of each kind, in the order of `Records`."""
+    """Return the number of an observation's rows of records of each kind, in the order of `Records`."""
     kept, others = scenario.topology.most_nearby, len(scenario.vehicles) - 1
     return {
         "target": kept or len(scenario.target_names),
@@ -163,7 +163,7 @@ def _scale(row: ObservationField, scenario: Scenario) -> float:
 
 
 def action_fields(scenario: Scenario, limits: Dynamics | None = None) -> tuple[ActionField, ...]:
-    """Return what the entries of an action mean: speed or acceleration, steering (positive turns left), pan and radio.
+    """Return the meaning of an action's entries: speed or acceleration, steering (positive turns left), pan and radio.
 
     `limits` are a vehicle's; None: the first one's.
     """

@@ -168,7 +168,7 @@ def results_table(scenario: Scenario, layout: Layout, device: str) -> Any:
 
 @device_function
 def store_for_next_step(state: Any, results: Any, world: int, vehicle: int, remaining: Any, furthest: Any, tick: int):
-    """Keep what the next step compares with; `assess` comes before."""
+    """Store the references of the next step; `assess` comes before."""
     results.last_arrivals[world, vehicle] = state.arrivals[world, vehicle]
     results.last_log_determinant[world, vehicle] = results.log_determinant[world, vehicle]
     results.furthest[world, vehicle] = furthest

@@ -29,7 +29,7 @@ class ActingLosses(Transform):
 
 
 class CooperativeTask(VmasClass):
-    """Worlds in a batch, like those of VMAS; `task(name, ...)` builds it."""
+    """A batch of worlds, like VMAS's; `task(name, ...)` builds it."""
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Any:
         """Return a maker of `num_envs` worlds in a batch."""
@@ -72,7 +72,7 @@ def task(name_or_path: ScenarioLike, **options: Any) -> CooperativeTask:
 
     Args:
         name_or_path: for example "urban_crossing".
-        options: those of `coopenv.make_vec` but `num_worlds`, `device`, `autoreset`, `arrays` and `observation`.
+        options: options of `coopenv.make_vec` but `num_worlds`, `device`, `autoreset`, `arrays` and `observation`.
             `render_mode="rgb_array"` and `ExperimentConfig.render` make films of evaluations.
     """
     return CooperativeTask(name=scenario_name(name_or_path), config={"name_or_path": name_or_path, **options})

@@ -89,7 +89,7 @@ class CooperativeSB3VecEnv(VecEnv):
         return self.envs.observation_layout
 
     def reset(self) -> Any:
-        """Start a new episode in every world; what `seed()` and `set_options()` have given counts once.
+        """Start a new episode in every world; `seed()` and `set_options()` apply once.
 
         Options are those of `CooperativeVectorEnv.reset`; its settings hold until they are given again.
         """
@@ -100,11 +100,11 @@ class CooperativeSB3VecEnv(VecEnv):
         return observation
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """Return what the next step depends on as arrays, for `set_state`; plug-in observers cannot be among it."""
+        """Return the state of the next step as arrays, for `set_state`; plug-in observers are not supported."""
         return {**self.engine.get_state(), "episode_sums": self._recorder.sums.copy()}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Go on from what `get_state` returned, and return the observations that came with it.
+        """Continue from a state of `get_state`, and return its observations.
 
         Raises:
             CoopenvError: it does not fit.
@@ -221,7 +221,7 @@ def make_sb3_vec_env(name_or_path: ScenarioLike, *, seed: int | None = None, **o
 
 
 class ActingRowsBuffer(RolloutBuffer):
-    """Gives PPO minibatches of those rows alone whose vehicle was under way; flat observations only.
+    """Gives PPO minibatches of the rows of vehicles under way alone; flat observations only.
 
         model = PPO("MlpPolicy", env, rollout_buffer_class=ActingRowsBuffer, rollout_buffer_kwargs={"rows": env})
 
@@ -233,9 +233,9 @@ class ActingRowsBuffer(RolloutBuffer):
         """Build the buffer.
 
         Args:
-            *arguments: those of SB3's `RolloutBuffer`.
+            *arguments: arguments of SB3's `RolloutBuffer`.
             rows: the environment that the rollouts come from, without its wrappers.
-            **options: those of SB3's `RolloutBuffer`.
+            **options: options of SB3's `RolloutBuffer`.
         """
         self._rows = rows
         super().__init__(*arguments, **options)
@@ -302,7 +302,7 @@ def differentiate(layers: Sequence[nn.Linear], found: Sequence[Tensor], slope: T
 
     Args:
         layers: of the network.
-        found: what `outputs` returned.
+        found: the result of `outputs`.
         slope: derivative of the loss with respect to the network's output, (rows, A).
     """
     for layer, inputs in zip(reversed(layers), reversed(found[:-1]), strict=True):
@@ -345,7 +345,7 @@ class LeanPpo(PPO):
 
     @torch.no_grad()
     def train(self) -> None:
-        """Learn from the rollout, and log what SB3 logs."""
+        """Learn from the rollout, and log SB3's figures."""
         self._update_learning_rate(self.policy.optimizer)
         clip, buffer = self.clip_range(self._current_progress_remaining), self.rollout_buffer
         passes = [[self._improve(rows, clip) for rows in buffer.get(self.batch_size)] for _ in range(self.n_epochs)]

@@ -110,7 +110,7 @@ class BatchedWorlds(EnvBase):
         return found.update({"done": done, "terminated": terminated, "truncated": done & ~terminated})
 
     def _results(self, acted: torch.Tensor, flags: dict[str, torch.Tensor]) -> TensorDict:
-        """Return what the agents get, 0 in the rows (W, N) that have not acted; with flags (W, N, 1) of theirs."""
+        """Return the agents' entries, 0 in the rows (W, N) that have not acted; with flags (W, N, 1) of acting."""
         ended, fresh = self._field("ended"), self._field("under_way")
         info = {name: self._field(name).float() for name in QUALITIES}
         info |= {name: (fresh & (ended == code)).float() for name, code in EVENTS.items()}
@@ -131,8 +131,8 @@ def batched_env(
 
     Args:
         name_or_path: as for `coopenv.make_vec`.
-        num_worlds: how many worlds.
-        seed: that of the batch; None: one for training is drawn.
+        num_worlds: number of worlds.
+        seed: seed of the batch; None: a training seed is drawn.
         options: whatever else `coopenv.make_vec` takes but `autoreset`, `arrays` and `observation`.
 
     Raises:

@@ -114,7 +114,7 @@ def without_landmarks(recording: Recording, fault: Fault, seed: int) -> Recordin
 
 
 def with_jammer(recording: Recording, fault: Fault, seed: int) -> Recording:
-    """Lose what arrives in the range of jammers, as `[faults.jammer]` of a scenario does.
+    """Drop messages in the range of jammers, as `[faults.jammer]` of a scenario does.
 
     Raises:
         CoopenvError: the range is limited and true positions are not known.

@@ -54,19 +54,19 @@ def perform(
     width: str | None = None,
     as_json: bool = False,
 ) -> Leaderboard:
-    """Compare, print the tables (or JSON), write the files, and return what was found.
+    """Compare, print the tables (or JSON), write the files, and return the comparison.
 
     Args:
-        plan: what is compared.
+        plan: the comparison.
         command: the command line that gives the same table again.
-        executor: where the observers run.
+        executor: executor of the observers.
         printed: console of the tables.
         log: console of the progress.
         basin: draws of initial estimates; 0: no study of basins.
         out: folder of the files; None: no files.
         figures: format of figures as files of their own; None: figures are in the report alone.
         width: column of `coopenv.viz.figures` that these figures are drawn for; None: a page's.
-        as_json: whether the content of `leaderboard.json` is printed in place of the tables.
+        as_json: print the content of `leaderboard.json` in place of the tables.
 
     Raises:
         CoopenvError: something that was asked for does not exist, or cannot be written.
@@ -174,7 +174,7 @@ def report_text(board: Leaderboard, content: Mapping[str, Any]) -> str:
 
 
 def _variant(board: Leaderboard, name: str) -> dict[str, Any]:
-    """Return what the template shows of one variant."""
+    """Return the template's entries of one variant."""
     return {
         "name": name,
         "summary": board.variants[name],
@@ -187,7 +187,7 @@ def _variant(board: Leaderboard, name: str) -> dict[str, Any]:
 
 
 def _tints(board: Leaderboard) -> Callable[[float], Markup]:
-    """Return what gives a cell of the table of variants the darker a background, the larger its error."""
+    """Return the style of the table of variants: the larger the error, the darker the cell's background."""
     sizes = [math.log(total.rmse.value) for total in board.totals.values() if total.rmse.value > 0]
     low, high = min(sizes, default=0.0), max(sizes, default=1.0)
 

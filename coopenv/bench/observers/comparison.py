@@ -161,11 +161,11 @@ def compare(
     For example `coopenv.compare(["riccati", Mine], "busy_intersection_tracking", seeds=20)`.
 
     Args:
-        observers: one or several names, classes, or where they stand (`mine.py:Mine`, `package.module:Mine`); None: all
+        observers: one or several names, classes, or import paths (`mine.py:Mine`, `package.module:Mine`); None: all
             that suit.
         environment: name, TOML file, dict or scenario, as for `coopenv.load_scenario`; recorded robots (`mrclam_1`,
             `mrclam_1_space`, ...), MCAP file or ROS bag.
-        seeds: how many (0, 1, ...), or which; what is recorded has one record whatever they are.
+        seeds: their number (0, 1, ...), or a list; recorded data have one record for any seeds.
         variants: names, or "all": faults of an environment, what recorded robots see; None: the usual ones.
         overrides: dotted scenario keys, for example {"noise.enabled": False}.
         steady_from: start of the steady state, s; None: after 70 % of the run.

@@ -159,7 +159,7 @@ def basins_of(environment: str, draws: Sequence[Draw]) -> list[Basin]:
 
 
 def basin_table(basins: Sequence[Basin]) -> Table:
-    """Return how many draws converge, one line per observer."""
+    """Return the number of draws that converge, one line per observer."""
     numbers = ["draws", "failed", "all vehicles\nconverge", "95 %", "converged [s]\nmedian"]
     table = number_table(["basin"], numbers, gap=0)
     for basin in basins:
@@ -209,7 +209,7 @@ class SeedStudy:
     final_orientation_error_deg: np.ndarray
 
     def document(self, environment: str) -> dict[str, Any]:
-        """Return what `bench seeds --json` prints: per vehicle, one figure per seed."""
+        """Return the output of `bench seeds --json`: per vehicle, one figure per seed."""
         figures = {name: values for name, values in vars(self).items() if isinstance(values, np.ndarray)}
         return {
             "environment": environment,

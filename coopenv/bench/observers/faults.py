@@ -181,7 +181,7 @@ class FaultVariant:
     name: str
     faults: tuple[Fault, ...] = ()
     scenario: Scenario | None = None
-    """The world with those faults that are keys of a scenario; None: there are none."""
+    """The world with the faults that are keys of a scenario; None: there are none."""
 
     @property
     def summary(self) -> str:

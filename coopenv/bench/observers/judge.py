@@ -47,7 +47,7 @@ class TimeWindow(NamedTuple):
         return STEADY if self.steady else f"{self.start:g}-{self.end:g} s"
 
     def ticks(self, t: Array) -> NDArray[np.bool_]:
-        """Return which of the times (K,) s lie within."""
+        """Return flags of the times (K,), s, within the window."""
         return np.asarray((t > self.start) & (t <= self.end))
 
 
@@ -70,7 +70,7 @@ class RecordProperties:
     windows: tuple[TimeWindow, ...]
     """W stretches that are judged one by one, the steady state last."""
     bounds: Array
-    """(3, N, W) m^2, those of `BOUNDS` in each window."""
+    """Variances (3, N, W), m^2, of `BOUNDS` in each window."""
     gramians: Array
     """(2, N) least eigenvalues over the run: about the map origin, mixed units; about the vehicle, no unit."""
     t: Array
@@ -107,7 +107,7 @@ class JudgedRun:
     observer: str
     scene: RecordProperties
     measures: Mapping[str, Array]
-    """Arrays (N,) by name, those of `IN_WINDOWS` (N, W), see `_measures`; costs alone where it failed."""
+    """Arrays (N,) by name, (N, W) for names in `IN_WINDOWS`, see `_measures`; costs alone where it failed."""
     nees_dof: int
     failure: str
     series: Series
@@ -115,7 +115,7 @@ class JudgedRun:
     """(B, B) vehicle ticks by horizontal error and protection level, both in bins of `LEVEL_BINS`; level known."""
 
     def measured(self, name: str) -> Array:
-        """Return what was measured of the vehicles; NaN where the observer failed, which has diverged."""
+        """Return the figures of the vehicles; NaN where the observer failed, which counts as diverged."""
         if name in self.measures:
             return self.measures[name]
         shape = (len(self.scene.vehicles), len(self.scene.windows))
@@ -224,7 +224,7 @@ class Task:
         return self.source, self.variant
 
     def parts(self, done: int = 0, ended: Mapping[str, str] = MappingProxyType({})) -> Iterator[JudgedRun | None]:
-        """Make the record, and run all observers but the first `done` on it; those of `ended` fail for that reason."""
+        """Make the record, and run all observers but the first `done` on it; observers in `ended` fail for it."""
         recording = self.source.recording(self.variant, self.seed)
         scene = scene_of(recording, self.source.steady_from(self.steady_from, recording), self.edges)
         yield None
@@ -242,7 +242,7 @@ def judge(task: Task) -> list[JudgedRun]:
 
 
 def judge_all(executor: Executor, tasks: Sequence[Task], on_done: Callable[[int], None]) -> list[list[JudgedRun]]:
-    """Judge the observers of all tasks; where the executor has limits, those that exceed one fail, the others do not.
+    """Judge the observers of all tasks; if the executor has limits, only observers that exceed one fail.
 
     An observer that was ended is not started again in the same variant; one that took too long not at all.
     """
@@ -288,7 +288,7 @@ def horizontal_error(recording: Recording, result: Run) -> Array:
 
 
 def level_measures(error: Array, result: Run) -> dict[str, Array]:
-    """Return what protection levels are worth (N,), over the whole run; NaN where none is stated.
+    """Return the figures of the protection levels (N,), over the whole run; NaN where none is stated.
 
     Shares of the ticks with a stated level in which the horizontal `error` (K, N), m, and the angle exceed it, and in
     which it is unknown; and the median known level over the 95th percentile of the horizontal error in the same ticks.

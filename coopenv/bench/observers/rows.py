@@ -89,7 +89,7 @@ def total(own: Sequence[JudgedRun], nominal: Sequence[JudgedRun], vehicles: Any 
 
 
 def _column(meaning: str) -> Any:
-    """Declare a column with what it means, which the report prints."""
+    """Declare a column with its meaning, which the report prints."""
     return field(metadata={"meaning": meaning})
 
 
@@ -344,7 +344,7 @@ class Leaderboard:
 
     @cached_property
     def ranked(self) -> list[str]:
-        """The observers by their error in the first variant, those that failed there last."""
+        """The observers by their error in the first variant, failed ones last."""
         first = next(iter(self.variants))
         error = {name: self.totals[first, name].rmse.value for name in self.observers}
         return sorted(self.observers, key=lambda name: (error[name] != error[name], error[name]))

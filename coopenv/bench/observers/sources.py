@@ -52,7 +52,7 @@ class RecordSource(ABC):
     added: tuple[FaultVariant, ...] = field(default=(), kw_only=True)
     """Variants with faults that have parameters."""
     named: ClassVar[Mapping[str, str]] = {name: variant.summary for name, variant in VARIANTS.items()}
-    """The others, each with what it is."""
+    """The other variants, with a description each."""
     usual: ClassVar[tuple[str, ...]] = (NOMINAL,)
     """Variants that are run by default."""
     seeded: ClassVar[bool] = False
@@ -105,12 +105,12 @@ class RecordSource(ABC):
             check_recorded(variant, vehicles, targets[: len(targets) - len(vehicles)])
 
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
-        """Return when the steady state starts, s; without a record only what is asked for is checked.
+        """Return the start of the steady state, s; without a record only a given start is checked.
 
         Recorded robots are judged from the start on, where their poses are known.
 
         Raises:
-            CoopenvError: what was asked for does not lie within the record.
+            CoopenvError: the given start does not lie within the record.
         """
         if given is not None and not 0.0 <= given < math.inf:
             raise CoopenvError(f"start of the steady state at {given:g} s: not within the run")
@@ -200,7 +200,7 @@ class LogFile(RecordSource):
 
 @dataclass(frozen=True)
 class Bags(RecordSource):
-    """A ROS bag, with faults; what its environment draws follows from the seed."""
+    """A ROS bag, with faults; the draws of its environment follow from the seed."""
 
     path: Path
     topics: Path | None
@@ -259,7 +259,7 @@ def find_source(
         text: which one.
         overrides: dotted keys of its scenario.
         data: folder of recorded data sets.
-        topics: what the topics of a ROS bag are.
+        topics: map of a ROS bag's topics.
         faults: variants with parameters, see `coopenv.bench.observers.faults`.
         policy: of the driven vehicles of a simulated environment; None: action zero.
 

@@ -342,7 +342,7 @@ def latex(board: Leaderboard, variant: str) -> str:
 
 
 def environment(**options: Any) -> Environment:
-    """Return what renders the templates beside the report's."""
+    """Return the renderer of the templates beside the report's."""
     loader = PackageLoader("coopenv.bench.observers", "page")
     return Environment(loader=loader, undefined=StrictUndefined, **options)
 

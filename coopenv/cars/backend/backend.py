@@ -155,7 +155,7 @@ class Svea:
         self.drain()
 
     def _arm(self, release: bool) -> None:
-        """Open the gates, those of cars that another station has stopped with `release`, and watch the cars.
+        """Open the gates, with `release` also of cars that another station has stopped, and watch the cars.
 
         Raises:
             CoopenvError: a condition of arming does not hold.
@@ -289,7 +289,7 @@ class Svea:
         self._armed = False
 
     def close(self) -> None:
-        """Stop, and leave the network. Raises OutputError: what comes and goes could not be written to the end."""
+        """Stop, and leave the network. Raises OutputError: the messages could not be written to the end."""
         if not self._closed.acquire(blocking=False):
             return
         self.stop("closed")

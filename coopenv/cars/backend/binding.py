@@ -62,7 +62,7 @@ def bind(
     """Return the binding.
 
     Args:
-        scenario: what the cars are vehicles of.
+        scenario: scenario of the cars as vehicles.
         cars: the fleet.
         markers: numbers of the markers of landmarks, by name.
         where: name of the file, for errors.

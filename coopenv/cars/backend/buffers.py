@@ -200,7 +200,7 @@ class StatusBoard:
             transport: the network.
             cars: their names.
             remote: channels of their remote controls.
-            needed: whether cars must send the conditions of their profile.
+            needed: True if cars must send the conditions of their profile.
             profile: make of the cars.
         """
         self._lock = threading.Lock()

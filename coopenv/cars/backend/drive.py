@@ -81,7 +81,7 @@ class DriveRecorder:
         self._thread.start()
 
     def tick(self, index: int, now: int, key: int = 0, episode: int = 0) -> None:
-        """Mark that a tick was made at a time in ns of what had come before.
+        """Mark that a tick was made at a time in ns from the earlier messages.
 
         With tick 0 an episode begins; its key and number fix what was drawn.
         """
@@ -100,7 +100,7 @@ class DriveRecorder:
         self._queue.put((STOPPED_TOPIC, encode(message), now))
 
     def close(self) -> None:
-        """Write what is left and close the file; one without an episode is removed.
+        """Write the rest and close the file; a file without an episode is removed.
 
         Raises:
             OutputError: it could not be written to the end; what stands in it can be replayed.
@@ -177,7 +177,7 @@ class Drive(TickGenerator):
             DataError: it is none, or is damaged.
             CoopenvError: an override is not valid, or the extra is missing.
         """
-        codec()  # whose error names the missing extra
+        codec()  # its error names the missing extra
         from coopenv.backends.mcap_container import Container
 
         self._where = str(path)

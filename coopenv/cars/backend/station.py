@@ -44,7 +44,7 @@ class Station:
 
         Args:
             transport: the network.
-            topics: what to subscribe to.
+            topics: topics to subscribe to.
             verifier: checks signatures; None: nothing is signed.
             signers: identities that may sign a topic, for topics that could be forged.
         """
@@ -184,7 +184,7 @@ class Gates:
         profile: CarProfile = SVEA,
         probed: bool = True,
     ) -> None:
-        """Listen to the gates; with a verifier only to what they have signed.
+        """Receive from the gates; with a verifier only signed messages.
 
         Unless not `probed`, arming tries from here a neutral command to the wheels: a gate that notices it stays shut.
         """
@@ -246,7 +246,7 @@ class Gates:
             self._before.setdefault(car, counts)
 
     def begin(self, release: bool = False) -> None:
-        """Arm all gates for a new session; those stopped by another station only with `release`.
+        """Arm all gates for a new session; gates stopped by another station only with `release`.
 
         Raises:
             CoopenvError: a gate is absent, does not open, or is stopped meanwhile; all are closed again then.

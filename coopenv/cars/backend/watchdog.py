@@ -202,13 +202,13 @@ class Watchdog:
         """Begin to look.
 
         Args:
-            safety: what is allowed.
-            station: where messages come.
+            safety: limits.
+            station: receiver of the messages.
             gates: of the cars.
             monitor: ages of messages and positions of cars.
-            cars: those that are driven here.
+            cars: the cars that are driven here.
             others: the other ones of the fleet.
-            odometry: what each car has to measure.
+            odometry: required measurements of each car.
             decision: s between decisions.
             happened: returns the reason to stop a car by its own conditions; empty: none.
             stopped: called when the cars are stopped.
@@ -247,7 +247,7 @@ class Watchdog:
         self._beat, self._missed = time.monotonic(), missed
 
     def set_present(self, token: str, there: bool) -> None:
-        """Note that a token of presence has appeared or disappeared; those of other ends do not count."""
+        """Note that a token of presence has appeared or disappeared; tokens of other ends do not count."""
         if token in self._present:
             self._present[token] = there
 

@@ -1,4 +1,4 @@
-"""Offsets of clocks in a bag: by times of reception, robust against wrong stamps, and by what topics measure.
+"""Offsets of clocks in a bag: by times of reception, robust against wrong stamps, and by the topics' measurements.
 
 - By reception: the delay (received - stamp) of a topic is the offset of its clock and the time of transport. Its level
   is a low quantile over windows; a robust line through the windows gives offset and drift. A level that changes from
@@ -29,7 +29,7 @@ from coopenv.estimation.poses import Array
 Times = NDArray[np.int64]
 
 OUTLYING = 50_000_000
-"""ns by which a delay may be off those around it before its stamp counts as wrong, five times their spread at least."""
+"""Least deviation (ns) of a delay from its neighbours at which its stamp is wrong; at least five times their spread."""
 WILD, NEAR = 10_000_000_000, 101  # ns between the middle of the delays near one, and a low one, that is no transport
 STEADY = 25  # messages on both sides of a jump whose delays are compared
 WINDOWS, LEAST = 20, 10  # number of windows, and of messages in one
@@ -46,7 +46,7 @@ class Delay:
 
 
 def outlying(stamps: Times, received: Times) -> NDArray[np.bool_]:
-    """Return which stamps (n,) are wrong: ahead of those around them, or behind them and out of order."""
+    """Return flags of wrong stamps (n,): ahead of their neighbours, or behind them and out of order."""
     delays = (received - stamps).astype(np.float64)
     size = min(NEAR, 2 * (len(delays) // 2) + 1)
     low, middle = (percentile_filter(delays, share, size=size, mode="mirror") for share in (20, 50))
@@ -100,7 +100,7 @@ def delay_of(stamps: Times, received: Times) -> Delay:
 
 
 def checked(stamps: Times, received: Times) -> tuple[NDArray[np.bool_], Delay | None]:
-    """Return which stamps (n,), 0 for none, are wrong, and the delay by the others; None: there are none."""
+    """Return flags of wrong stamps (n,), 0 for none, and the delay by the others; None: there are none."""
     wrong = np.zeros(len(stamps), bool)
     if not (given := stamps != 0).any():
         return wrong, None
@@ -124,7 +124,7 @@ ABSURD = 0.1  # rad between bearings and poses, with which no camera or map is r
 
 @dataclass(frozen=True)
 class Lead:
-    """Offset between the stamps of two topics by what they measure."""
+    """Offset between the stamps of two topics by their measurements."""
 
     seconds: float  # by which the stamps of the first are early
     error: float  # its standard error
@@ -178,7 +178,7 @@ Residual = Callable[[float], tuple[Array, Array]]
 
 
 def fit(e: Array, N: Array, w: Array | None = None, *, scaled: bool = False) -> tuple[Array, Array]:
-    """Return what N (n, p) does not explain of e (n,), and weights (n,), 0 or 1, without outliers unless given.
+    """Return the residual of e (n,) by N (n, p), and weights (n,), 0 or 1, without outliers unless given.
 
     With `scaled`, the first factor is not negative.
     """
@@ -239,7 +239,7 @@ def lead_by(residual: Residual, times: Array, most: float, least: float, *, scal
 
 
 def lead_of_motion(signal: SampledSignal, reference: SampledSignal, least: float = FLOOR) -> Lead | None:
-    """Return by how much the stamps of turns or distances are early, by another source of the same."""
+    """Return the lead of the stamps of turns or distances, by another source of the same."""
     span = reference.times[-1] - reference.times[0]
     begin = np.arange(reference.times[0], reference.times[-1] - INTERVAL, max(STEP, span / MOST))
     end, one = begin + INTERVAL, np.ones((len(begin), 1))
@@ -252,7 +252,7 @@ def lead_of_motion(signal: SampledSignal, reference: SampledSignal, least: float
 
 
 def lead_of_bearings(times: Array, azimuths: Array, targets: Array, camera: Array, path: SampledSignal) -> Lead | None:
-    """Return by how much the stamps of bearings are early, by the known path (x, y, heading) of the car.
+    """Return the lead of the stamps of bearings, by the known path (x, y, heading) of the car.
 
     They are (n,) times, s, azimuths in the body frame and (n, 2) targets in the map; the camera is at (2,) in the body.
     Wrong mountings and lenses look like an offset while the car turns, so their first-order effects are fitted with it:
@@ -292,7 +292,7 @@ CAMERAS = (Role.DETECTIONS, Role.BEARINGS)
 
 
 def leads_of(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Binding) -> dict[str, Lead]:
-    """Return by how much the stamps of the topics of vehicles are early by what they measure.
+    """Return the lead of the stamps of the vehicles' topics by their measurements.
 
     The reference is motion capture, or the camera where there is none; topics without enough motion are left out.
     """
@@ -353,7 +353,7 @@ def _azimuths(samples: Sequence[Sample], start: int, binding: Binding, vehicle: 
 def moves_of(
     leads: Leads, topics: Sequence[Chosen], tolerance: float, fixed: Set[str], delays: Mapping[str, float]
 ) -> dict[str, int]:
-    """Return what is added to the stamps of topics, ns, so that they agree with their reference up to a tolerance, s.
+    """Return the corrections of topics' stamps, ns, so that they agree with their reference up to a tolerance, s.
 
     The `fixed` ones stay. Where more topics with small `delays` behind sources, s, agree with each other than with
     the reference, that is moved. Odometry without a lead goes with other odometry of its car that has the same delay.

@@ -56,7 +56,7 @@ class BagFile:
             self.counts = {name: int(info.msgcount) for name, info in self._reader.topics.items()}
             self.seconds = max(0.0, (self._reader.end_time - self._reader.start_time) * 1e-9)
             """Between its first and its last message."""
-        except Exception as error:  # whatever the library raises at files that make no sense
+        except Exception as error:  # any error of the library at a malformed file
             self._stack.close()
             raise error if isinstance(error, CoopenvError) else self._unreadable(error) from None
         self._warn_damaged()

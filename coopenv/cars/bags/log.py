@@ -1,4 +1,4 @@
-"""Everything that is read of one or several bags: samples of all cars on one clock, and a table of what there is.
+"""The data of one or several bags: samples of all cars on one clock, and a table of the topics.
 
 Every message has two times: its stamp, by the clock of who sent it, and when it was received, by the clock of who
 recorded it. A *source* is whose clock makes the stamps: a car, or motion capture, which is one source for all bodies,
@@ -57,7 +57,7 @@ class Clocks:
 
 
 def reconcile(files: Sequence[Delays], tolerance: float, stated: Mapping[str, int]) -> Clocks:
-    """Return what is to be added to the times of every source and file.
+    """Return the corrections of the times of every source and file.
 
     Args:
         files: delays of the sources of each file.
@@ -75,7 +75,7 @@ def reconcile(files: Sequence[Delays], tolerance: float, stated: Mapping[str, in
 
 
 def recorders(files: Sequence[Delays]) -> list[int | None]:
-    """Return by how many ns the recorder of each file is behind that of the first one; None: not known."""
+    """Return the lag (ns) of each file's recorder behind the first one's; None: unknown."""
     behind: list[int | None] = [0, *(None for _ in files[1:])]
     known = [0]
     while known:
@@ -96,7 +96,7 @@ ReadValue = Callable[[Chosen, Any], Value]
 def value_reader(
     given: TopicMap, binding: Binding, chosen: Collection[Chosen], calibrations: Mapping[str, Calibration]
 ) -> ReadValue:
-    """Return what reads messages by the map.
+    """Return the reader of messages by the map.
 
     Args:
         given: the map.
@@ -169,7 +169,7 @@ class Track:
     jumps: list[tuple[int, int]] = field(default_factory=list)  # first message after each, and ns that were added
     outlying: int = 0  # messages that were dropped for their stamps
     delay: Delay | None = None  # None: no message with a stamp
-    source: str = ""  # whose clock makes the stamps
+    source: str = ""  # source of the stamps' clock
 
     def clean_stamps(self, mode: str) -> None:
         """Drop messages with wrong stamps, after jumps of the clock if a mode removes them; measure the delay."""
@@ -187,7 +187,7 @@ class Track:
         self.entries = [entry for entry, off in zip(self.entries, wrong, strict=True) if not off]
 
     def behind(self, clocks: Clocks) -> float | None:
-        """Return by how many s it is behind after stamps of its source were moved; None: not known."""
+        """Return its lag (s) after its source's stamps were moved; None: unknown."""
         delay, shift = self.delay, clocks.shifts.get(self.source)
         if delay is None or shift is None or shift.offset is None:
             return None
@@ -211,7 +211,7 @@ APART = NS  # ns between the delays of two topics of a car beyond which they hav
 def tracks_of(
     number: int, file: BagFile, chosen: Collection[Chosen], value: ReadValue, clocks: ClockSettings
 ) -> list[Track]:
-    """Return what a file of that number has on the chosen topics."""
+    """Return the messages of a file, by its number, on the chosen topics."""
     wanted = [entry for entry in chosen if entry.role is not Role.CAMERA_INFO and entry.topic in file.topics]
     tracks = {entry.topic: Track(number, entry) for entry in sorted(wanted, key=lambda entry: entry.topic)}
     for topic, received, decode in file.messages(tracks):
@@ -234,7 +234,7 @@ def tracks_of(
 
 
 def delays_of(tracks: Sequence[Track], files: int, tolerance: float, stated: Collection[str] = ()) -> list[Delays]:
-    """Return by how many ns each source is behind the recorder, for each of so many files; set the tracks' sources.
+    """Return the lag (ns) of each source behind the recorder, for each of so many files; set the tracks' sources.
 
     Topics ahead of it by more than the tolerance, ns, do not count where others are not; those `stated` are sources.
     """
@@ -255,7 +255,7 @@ def delays_of(tracks: Sequence[Track], files: int, tolerance: float, stated: Col
 
 @dataclass(frozen=True)
 class TopicRow:
-    """A topic; what is not known is None."""
+    """A topic; unknown values are None."""
 
     topic: str
     type: str
@@ -270,7 +270,7 @@ class TopicRow:
     outlying: int | None = None  # messages that were dropped for their stamps
     lead: float | None = None  # s by which its stamps are early, by what it measures
     lead_error: float | None = None  # s, standard error
-    reference: str | None = None  # what they are early against
+    reference: str | None = None  # reference of their lead
 
 
 def rows_of(
@@ -281,7 +281,7 @@ def rows_of(
     tracks: Sequence[Track],
     leads: Leads,
 ) -> tuple[TopicRow, ...]:
-    """Return a row per topic, those that are read before the others."""
+    """Return a row per topic, read topics first."""
     read_as = {entry.topic: entry for entry in chosen}
     names = sorted({name for file in files for name in file.topics}, key=lambda name: (name not in read_as, name))
     times: dict[tuple[str, str], list[int]] = {}
@@ -318,8 +318,8 @@ class BagLog:
     """Result of reading a bag."""
 
     samples: tuple[Sample, ...]  # in the order of their stamps, which all are on one clock
-    rows: tuple[TopicRow, ...]  # what there is, by topic
-    notes: tuple[str, ...]  # what a user should know
+    rows: tuple[TopicRow, ...]  # topics of the bag
+    notes: tuple[str, ...]  # remarks for the user
     lenses: Mapping[str, Calibration] = field(default_factory=dict)  # by car; none: its bearings are without pixels
     added: Mapping[tuple[str, Role], tuple[str, float]] = field(default_factory=dict)
     """Topic, and s added to its stamps, by car and role."""
@@ -414,7 +414,7 @@ def _samples(tracks: Sequence[Track], clocks: Clocks, moves: Mapping[str, int]) 
 
 
 def _notes(tracks: Sequence[Track], clocks: Clocks, given: TopicMap, drifts: Mapping[str, float]) -> Iterator[str]:
-    """Yield what was left out, moved, or used unchanged."""
+    """Yield notes on data left out, moved, or used unchanged."""
     for track in tracks:
         total = track.refused.total() + len(track.entries) + track.outlying
         if track.delay is not None and track.delay.jump:
@@ -444,7 +444,7 @@ def _notes(tracks: Sequence[Track], clocks: Clocks, given: TopicMap, drifts: Map
 def _lead_notes(
     tracks: Sequence[Track], clocks: Clocks, given: TopicMap, leads: Leads, moves: Mapping[str, int]
 ) -> Iterator[str]:
-    """Yield which topics were moved by what they measure, or were not, and the key that states it."""
+    """Yield notes on topics moved, or not moved, by their measurements, and the key that states it."""
     seen: set[str] = set()
     for track in tracks:
         topic, shift = track.chosen.topic, clocks.shifts.get(track.source)

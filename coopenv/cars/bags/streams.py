@@ -1,4 +1,4 @@
-"""The messages of bag files in the order of the file, without an index, within limits of what they unpack to.
+"""The messages of bag files in the order of the file, without an index, within limits of their unpacked size.
 
 `Part` takes the place of the readers of rosbags. So a file whose recording broke off is read as far as it goes: it may
 break off within a chunk, of which what can be unpacked counts as well.
@@ -75,7 +75,7 @@ class Part:
                 raise EOFError(ENDS_EARLY)
         except (TooLargeError, apsw.TooBigError) as error:
             raise TooLargeError(str(error)) from None
-        except Exception as error:  # whatever the libraries raise where a file breaks off
+        except Exception as error:  # any error of the libraries at a truncated file
             self.error = error
 
 

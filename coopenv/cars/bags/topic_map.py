@@ -57,7 +57,7 @@ class TopicMapError(CoopenvError):
 
 
 class Topics(Section):
-    """Topics of one car, in place of those of the naming scheme."""
+    """Topics of one car, in place of the naming scheme's."""
 
     detections: TopicName | None = None
     """pixy_camera/ObjectInfoArrayStamped: blocks in pixels; sensor_msgs/Image or CompressedImage: frames with tags;
@@ -192,7 +192,7 @@ class TopicMap(Section):
     """File that `coopenv calibrate` has written (relative to this file): its overrides, leads of clocks and corrections
     replace those of this file."""
     corrections: dict[Name, Correction] = Field(default={})
-    """Constants by the name of a car, instead of those that it publishes."""
+    """Constants by the name of a car, instead of the published ones."""
     names: str = "svea"
     """Scheme of topic names, unless `cars.topics` gives others: `authors`, `none`, or a profile as in a deployment
     file, `svea` or a TOML file (relative to this file)."""
@@ -213,7 +213,7 @@ class TopicMap(Section):
     clocks: ClockSettings = ClockSettings()
     frames: PositionFrames = PositionFrames()
     vision: VisionSettings = VisionSettings()
-    """Frames and tags (default: those of the profile)."""
+    """Frames and tags (default: the profile's)."""
     make: CarProfile = Field(default=SVEA, exclude=True)
     """Profile of `names`, or SVEA's; set by `load_map`."""
     path: Path = Field(default=Path("topics.toml"), exclude=True)

@@ -51,10 +51,10 @@ class Fake:
             name: of the car.
             transport: the network; stays the caller's.
             seed: of where it starts and of its errors, which are those of the simulation with that key.
-            differential: whether the wheels measure a turn rate, as they do where no other sensor does.
+            differential: the wheels measure a turn rate, because no other sensor does.
             gate: connects a gate of its own, through which commands come; None: it obeys ManualControl on the network.
             clock: wall and steady; the wall clock is that of motion capture.
-            settings: what differs from the environment.
+            settings: differences from the environment.
         """
         self._settings = settings
         self.name, self._clock, self._profile, self._faults = name, clock, binding.profile, CarFaults()
@@ -220,7 +220,7 @@ def replay(
     seed: int,
     start: CarPose | None = None,
 ) -> Sent:
-    """Return what a fake sends under commands at times in ns, up to the last one; `start` is its pose (None: any)."""
+    """Return a fake's messages under commands at times in ns, up to the last one; `start` is its pose (None: any)."""
     now = commands[0][0]
     clock = GateClock(lambda: now, lambda: now)
     arrived: list[tuple[str, bytes, int]] = []

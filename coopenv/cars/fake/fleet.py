@@ -161,12 +161,12 @@ REST = 0.004
 
 
 def prepare_fake(path: str | Path, car: str, gate: bool = True, station: str | None = None) -> Callable[..., Fake]:
-    """Return what makes a fake of a network and further arguments of `Fake`: all that can be wrong without a network.
+    """Return the constructor of a fake from a network and further arguments of `Fake`, checked as far as possible.
 
     Args:
         path: deployment file.
         car: its name.
-        gate: whether commands come through a gate of its own; else it obeys ManualControl.
+        gate: use a gate for commands; otherwise the fake obeys ManualControl.
         station: whose commands count at its gate (None: those of the file's `security.identity`).
 
     Raises:

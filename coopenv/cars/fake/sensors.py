@@ -51,7 +51,7 @@ class SensorPublisher:
         self.name, self._profile, self._network = name, profile, network
 
     def send(self, role: Role, stamp: int, frame: str, /, **fields: Any) -> None:
-        """Publish a message by its fields, which are those of SVEA's type; a stamp in ns.
+        """Publish a message by its fields, the fields of SVEA's type; a stamp in ns.
 
         Types without covariances, or without a twist, get what they have room for.
         """
@@ -67,7 +67,7 @@ class SensorPublisher:
 
 
 class CarSensors:
-    """Odometry and condition of one car. Lasting errors are those that the world has drawn."""
+    """Odometry and condition of one car. Lasting errors are drawn by the world."""
 
     def __init__(
         self, world: CarWorld, publisher: SensorPublisher, settings: FakeSettings, *, differential: bool
@@ -183,10 +183,10 @@ class FakeCamera:
         """Put it on the car.
 
         Args:
-            world: what it looks at.
+            world: the observed world.
             binding: markers of the cars and of landmarks, and the make, which states what it publishes.
             others: the other cars, which are placed for each frame.
-            faults: that it may have.
+            faults: possible faults.
             publisher: of its messages.
             settings: size of the markers.
 
@@ -315,7 +315,7 @@ INSIDE = (np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0)), axis=-1).reshape
 """Rays through a pixel, from its middle: downwards and to the right, in pixels."""
 
 WHITE, BLACK, WALL, OUTSIDE = 220.0, 30.0, 120.0, -1.0
-"""Shades of tags, and of what is behind them; what is not on a tag."""
+"""Shades of tags, of their background, and outside of tags."""
 
 
 class PlacedTag(NamedTuple):

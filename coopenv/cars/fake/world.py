@@ -53,7 +53,7 @@ class CarWorld(World):
         """Build it.
 
         Args:
-            scenario: what it is a world of.
+            scenario: scenario of the world.
             agent: index of the agent that this car is, a moving landmark or, after the landmarks, a vehicle.
             frames: whether cameras take frames, which have noise of their own: sight is exact.
 
@@ -124,7 +124,7 @@ class CarWorld(World):
         return self.view("rotation")[0, agent], self.view("position")[0, agent]
 
     def distance(self, agent: int) -> float:
-        """Return how far the body of another agent is, m."""
+        """Return the distance to the body of another agent, m."""
         place = self.view("position")[0]
         return math.dist(place[agent], place[self.agent])
 
@@ -141,7 +141,7 @@ class Neighbours:
         """Listen.
 
         Args:
-            world: where they are put.
+            world: their world.
             binding: vehicles and markers of the cars.
             name: of the own car.
             transport: the network.
@@ -200,7 +200,7 @@ class Actuators:
         self._waiting.extend([(begin, drive), (begin + self._timeout, NEUTRAL)])
 
     def pieces(self, begin: int, end: int) -> Iterator[tuple[float, MotionCommand]]:
-        """Yield (how long in s, what is followed) from a time to a later one; each stretch is asked for once."""
+        """Yield (duration in s, followed command) from a time to a later one; each stretch is read once."""
         now = begin
         while now < end:
             while self._waiting and self._waiting[0][0] <= now:

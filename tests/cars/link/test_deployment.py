@@ -311,7 +311,11 @@ BAD_PROFILES = {
     "old commands": ("max_age = 0.15, urgent", "max_age = 0.2, urgent", "topics.command.max_age: needed, above 0 and"),
     "commands of any age": ("max_age = 0.15, urgent", "urgent", "topics.command.max_age: needed, above 0 and at most"),
     "a slash in front": ('"robots/{car}/imu', '"/robots/{car}/imu', "topics.imu.name: String should match"),
-    "one field for both": ('field = "speed"', 'field = "steering_angle"', "speed.field: 'steering_angle' is steering.field"),
+    "one field for both": (
+        'field = "speed"',
+        'field = "steering_angle"',
+        "speed.field: 'steering_angle' is steering.field",
+    ),
     "a limit that is cut off": (
         "hardest = { speed = 1.0",
         "hardest = { speed = 1.2",
