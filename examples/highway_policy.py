@@ -1,4 +1,4 @@
-"""What localisation error costs a policy of highway-env: train it on the truth, run it on estimates.
+"""Cost of localisation errors to a policy of highway-env: train it on the truth, run it on estimates.
 
 Run: python examples/highway_policy.py           (five minutes on one core; the policy is kept in out/highway_policy.pt)
      python examples/highway_policy.py --quick   (half a minute, a policy that has hardly learnt)

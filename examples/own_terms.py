@@ -15,7 +15,7 @@ def smooth(ego):  # of what the vehicle knows; Warp compiles it
 
 
 def lost(ego, truth):  # the truth as well, so the scenario has to declare it
-    """Whether the estimate is more than a metre off."""
+    """True if the position error exceeds a metre."""
     return truth.position_error > 1.0
 
 

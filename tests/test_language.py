@@ -38,10 +38,11 @@ REPLACED = {
     ),
     r"MovedWorld|peeled|taped|by hand": "CosimulatedWorld, ablated_stages, recorded, the command",
     r"made to measure|(nothing|all) (was|were) tuned on": "parametric, held-out",
+    r"\"\"\"(?:what|who|whose|whom|how|those)": "a noun phrase or an imperative at the beginning of a docstring",
 }
 """Words of which a page and a program have none, as regular expressions, and words that take their place."""
-KEPT = ("liar_among_us", "Liar among us", "lane_liar", "ring_liar", '["heard"]', '"heard":')
-"""Names that stay: of an environment and scenes of the leaderboard, and of a saved field."""
+KEPT = ("liar_among_us", "Liar among us", "lane_liar", "ring_liar", '["heard"]', '"heard":', '"""What vehicle and env')
+"""Names that stay: of an environment and scenes of the leaderboard, of a saved field, and of a moved constant."""
 PROGRAMS = [
     file
     for folder, kinds in {"coopenv": "py", "examples": "py toml", "envs": "toml", "agents": "py toml md"}.items()
@@ -95,7 +96,10 @@ def test_names_comments_and_strings_have_words_of_the_field() -> None:
     assert len(found) > 200 and not {name: words for name, words in found.items() if words}
 
 
-@pytest.mark.parametrize("line", ["heard = Queue()", "ToldState", "def tell_all(): ...", "# nobody hears", "LaneLiar"])
+LINES = ["heard = Queue()", "ToldState", "def tell_all(): ...", "# nobody hears", "LaneLiar", '"""How it is named."""']
+
+
+@pytest.mark.parametrize("line", LINES)
 def test_words_are_found_in_names(line: str) -> None:
     assert replaced_words(f"first\n{line}")
 

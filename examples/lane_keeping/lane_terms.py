@@ -18,5 +18,5 @@ def lane(ego):
 
 
 def off_the_road(ego, truth):
-    """Whether the car has left the road."""
+    """Return 1 if the car has left the road."""
     return wp.abs(truth.position[0]) > ROAD
