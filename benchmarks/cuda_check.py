@@ -50,9 +50,9 @@ CASES: tuple[dict[str, Any], ...] = (
 """Overrides of `ENVIRONMENT` with every observer that has kernels, and with one on the host."""
 ENVIRONMENT = "urban_crossing"
 NEEDS = ("ptx_bytes", "registers", "stack", "spills")
-"""What has limits. Seconds have none, as they depend on the machine; the size of the PTX stands for them."""
+"""Limited quantities. Seconds have no limits, as they depend on the machine; the size of the PTX stands for them."""
 ROOM, REGISTERS = 1.25, 16
-"""What limits leave beside what `--accept` measures: a factor, and registers; architectures differ by as much."""
+"""Margin of limits over the values of `--accept`: a factor, and registers; architectures differ by as much."""
 STACK = 2048
 """B of stack per thread; a limit reaches it only where the need does."""
 BEGIN, END = "<!-- make cuda-check: begin -->", "<!-- make cuda-check: end -->"

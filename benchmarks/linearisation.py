@@ -35,7 +35,7 @@ LOOKS = 5.0  # s between looks
 
 
 class Look(NamedTuple):
-    """What all seeds came to at a time: means and their standard errors."""
+    """Results of all seeds at a time: means and their standard errors."""
 
     time: float
     bias: float  # m, of the estimated range

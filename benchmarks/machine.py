@@ -1,4 +1,4 @@
-"""What a reader of measured times needs to know of the machine. No names, no paths."""
+"""Description of the machine beside measured times. No names, no paths."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ MISSED = 10.0
 
 
 class Outcomes(NamedTuple):
-    """What a plan led to in each copy of a world."""
+    """Outcome of a plan in each copy of a world."""
 
     stated: np.ndarray  # (W,) m, 95th percentile of the stated deviations
     e95: np.ndarray  # (W,) m, of the true position errors

@@ -1,4 +1,4 @@
-"""What the live view costs: the share of a core of the process that simulates, draws and serves.
+"""Cost of the live view: the share of a core of the process that simulates, draws and serves.
 
 `python -m benchmarks.view [ENV ...]` prints it without anybody who watches, and with one who reads everything: at the
 frames a second that the environment gives, and at 20, of which that without the simulation is what watching adds.
@@ -24,7 +24,7 @@ RATE = 20.0  # frames/s, to which shares are scaled
 
 
 class Measured(NamedTuple):
-    """What was measured in a second: frames, and CPU time, s, of the whole process and of the simulation in it."""
+    """Measurements in a second: frames, and CPU time, s, of the whole process and of the simulation in it."""
 
     frames: float
     cpu: float

@@ -9,7 +9,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.utils import get_relative_url
 
 SHIM = "https://unpkg.com/iframe-worker/shim"
-"""What Material's plugin `offline` would load."""
+"""Script that Material's plugin `offline` would load."""
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # MkDocs loads this file by its path

@@ -1,4 +1,4 @@
-"""What a release says of itself: `python -m sitegen.release_notes v0.9.0` prints the changelog's section."""
+"""Notes of a release: `python -m sitegen.release_notes v0.9.0` prints the changelog's section."""
 
 import re
 import sys

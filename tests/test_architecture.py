@@ -55,7 +55,7 @@ def imports_of(path: Path) -> set[str]:
 
 @pytest.fixture(scope="module")
 def imports() -> dict[str, set[str]]:
-    """What every module imports."""
+    """The imports of every module."""
     return {name: imports_of(path) for name, path in MODULES.items()}
 
 

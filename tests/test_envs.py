@@ -19,7 +19,7 @@ from tests.helpers import env_suite
 from tests.helpers.env_suite import CHECKS, SHIPPED, Make, assert_equal, random_actions, rendering, rollout
 
 SMALLER = {"city": {"streets.blocks": [2, 2], "vehicles.0.count": 8, "vehicles.1.count": 4}}
-"""What makes large environments quick to test."""
+"""Overrides that make large environments quick to test."""
 
 
 @cache

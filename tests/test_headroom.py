@@ -23,7 +23,7 @@ from tests.helpers.env_suite import LARGEST, rest_slow
 pytestmark = pytest.mark.headroom
 
 WORLDS = {"open_square": 16, "facade": 16, "behind_truck": 16, "urban_crossing": 48, "large_crossing": 6}
-"""How many suffice for intervals that tell the drivers apart."""
+"""Number of worlds for intervals that separate the drivers."""
 MOST_TIME = 0.05
 """Share of the travel time that looking may cost."""
 
@@ -70,7 +70,7 @@ def test_no_deadlock_where_all_receive_each_other(environment: str, agent: str) 
 
 
 HELPERS = {"scout_platoon": 1, "lighthouse": 1, "broken_camera": 3, "take_turns": 1, "liar_among_us": 2}
-"""How many vehicles, the first ones, can help the others."""
+"""Number of vehicles, the first ones, that can help the others."""
 
 
 @cache

@@ -1,4 +1,4 @@
-"""What a host of repositories and its users read, and what the wheel and the source distribution hold."""
+"""Files for a host of repositories and its users, and the contents of wheel and source distribution."""
 
 from __future__ import annotations
 

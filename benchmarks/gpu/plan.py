@@ -18,7 +18,7 @@ class Stage:
     """A function of `benchmarks.gpu.work` that runs in a process of its own."""
 
     name: str
-    """What tables call it."""
+    """Name in tables."""
     work: str
     limit: float
     """s, after which it is ended."""

@@ -1,4 +1,4 @@
-"""What the stages do, each in a process of its own: `python -m benchmarks.gpu.work NAME JSON` prints a line of JSON."""
+"""Work of the stages, each in a process of its own: `python -m benchmarks.gpu.work NAME JSON` prints a line of JSON."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def tests(files: list[str], chosen: str) -> dict[str, Any]:
     import pytest
 
     class Count:
-        """How many tests ended how."""
+        """Number of tests by outcome."""
 
         def __init__(self) -> None:
             self.ends = {"passed": 0, "failed": 0, "left_out": 0}

@@ -1,4 +1,4 @@
-"""What the study consists of, its results, and what they say: interquartile means and probabilities of improvement.
+"""Plan, results and statistics of the study: interquartile means and probabilities of improvement.
 
 Source: Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, 2021 (both figures, and
 resampling of runs within environments).
@@ -38,7 +38,7 @@ class Method(Section):
     """A method of the study."""
 
     about: str = ""
-    """What it is, for the page."""
+    """Description for the page."""
     learner: Literal["benchmarl", "coopenv", "offline"]
     options: dict[str, Any] = Field(default={})
 

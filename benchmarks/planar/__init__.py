@@ -1,1 +1,1 @@
-"""How planar observers do on robots unlike those that they were fitted to (docs/data.md)."""
+"""Planar observers on robots other than the ones that they were fitted to (docs/data.md)."""

@@ -1,4 +1,4 @@
-"""What is measured: libraries, and cases as plain data that a worker process is told to build."""
+"""Subjects of the measurement: libraries, and cases as plain data for a worker process."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Library:
 
     name: str
     module: str
-    """What a user imports."""
+    """Module that a user imports."""
     build: str
     """module:function that makes a `Built` of a `Case`."""
     distributions: tuple[str, ...]
@@ -38,7 +38,7 @@ class Case:
     threads: int = 1
     dtype: str = "float32"
     tick: str = "camera ticks"
-    """What is counted as vehicle ticks."""
+    """Name of the counted vehicle ticks."""
     options: dict[str, Any] = field(default_factory=dict)
     """Whatever the library's builder wants to know."""
 

@@ -1,4 +1,4 @@
-"""How the cost of a step grows with vehicles, landmarks and worlds."""
+"""Growth of the cost of a step with vehicles, landmarks and worlds."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Sweep:
 
     @property
     def kind(self) -> str:
-        """What vehicles measure, and the observer if it is another one than in the other sweeps."""
+        """Sensing of the vehicles, and the observer if it differs from the other sweeps'."""
         kind = "three neighbours" if not self.sensed else "nearby" if self.nearby else "sensed"
         return kind if self.observer == "riccati" else f"{kind}, {self.observer}"
 

@@ -16,13 +16,13 @@ OnProgress = Callable[[str], None]
 
 @dataclass
 class Result:
-    """What is known of a case."""
+    """Results of a case."""
 
     case: Case
     built: dict[str, Any] = field(default_factory=dict)
-    """What `Workers.build` returned."""
+    """Result of `Workers.build`."""
     rounds: list[dict[str, Any]] = field(default_factory=list)
-    """What `Workers.run` returned."""
+    """Results of `Workers.run`."""
     problem: str = ""
     """Why there are no figures."""
 

@@ -30,7 +30,7 @@ class Report:
     """Everything that was measured."""
 
     command: str
-    """What measures the same again."""
+    """Command of the measurement."""
     environment: str
     seconds: float
     """Time per case and round."""

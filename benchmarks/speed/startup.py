@@ -1,4 +1,4 @@
-"""What has to be waited for before the first step: imports, and the compiling of kernels."""
+"""Delays before the first step: imports, and the compiling of kernels."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What a vehicle tick costs, stage by stage, and against another checkout: `python -m benchmarks.stages`."""
+"""Cost of a vehicle tick, stage by stage, and against another checkout: `python -m benchmarks.stages`."""

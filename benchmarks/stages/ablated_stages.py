@@ -54,7 +54,7 @@ class Setting:
     """A tick with some of its stages."""
 
     observer: Embedded | None = None
-    """What estimates; None: the scenario's observer."""
+    """Observer; None: the scenario's."""
     source: Source = SIMULATED
     overrides: Mapping[str, Any] | None = None
     """Changes of the scenario."""

@@ -32,7 +32,7 @@ print(time.process_time() - begin)
 
 @dataclass(frozen=True)
 class Case:
-    """What both sides step."""
+    """Environment that both sides step."""
 
     environment: str
     worlds: int = 512

@@ -1,4 +1,4 @@
-"""What worlds draw, as agents and trainers meet it: absent vehicles, options of resets, new routes under way."""
+"""Draws of worlds, as agents and trainers meet them: absent vehicles, options of resets, new routes under way."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What users of PettingZoo, Gymnasium and notebooks try without a page: it works, or one line says what does."""
+"""Habits of users of PettingZoo, Gymnasium and notebooks: they work, or one line names the alternative."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ ESTIMATED = (
     *("log_determinant", "position_std", "targets_in_view"),
 )
 SENT = ("outbox", "observer_outbox")
-"""How fields of a saved state begin that hold messages, of the radio and of an observer."""
+"""Prefixes of a saved state's fields with messages, of the radio and of an observer."""
 
 EVERYTHING = {"observation.include": list(GROUPS)}
 

@@ -182,14 +182,14 @@ TIMES = {"behind_truck": 6}  # as many worlds
 
 
 class Run(NamedTuple):
-    """What one driver came to; arrays have a row for every step of a vehicle that is under way."""
+    """Results of one driver; arrays have a row for every step of a vehicle that is under way."""
 
     observations: np.ndarray
     position_error: np.ndarray
     uncertainty: np.ndarray
     """The reward term."""
     drives_on: np.ndarray
-    """Whether the step gains at least 2 cm of the way and does not end the episode."""
+    """True if the step gains at least 2 cm of the way and does not end the episode."""
     total: float
     """Mean return of a vehicle."""
     layout: Any

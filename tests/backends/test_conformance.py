@@ -151,7 +151,7 @@ def test_masks_and_ages_mean_the_same(make: Make) -> None:
         known, errors = env.engine.backend.capabilities.truth, dict[str, float]()
 
         def settled() -> bool:
-            """Whether all that is looked for was there, which takes longer where a busy computer took frames."""
+            """True if all expected ticks have come, which takes longer if a busy computer delays frames."""
             return steps > 15 and ever_heard and ever_seen and all(error < 0.2 for error in errors.values())
 
         while env.agents and not settled() and steps < 55:
@@ -185,7 +185,7 @@ def driving(commands: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
 
 
 def test_actions_mean_the_same_speeds_and_angles(folder: Path, processes: Path) -> None:
-    """What goes out to the gates is what the simulated vehicles follow, whatever network it takes.
+    """The commands to the gates equal the commands of the simulated vehicles, on any network.
 
     Commands are not sent again where a network loses one, so that actions go on until enough have been heard.
     """

@@ -274,7 +274,7 @@ class Neighbourly(Fleet):
 
 
 SAID = {"odometry": np.zeros(6), "depends_on": np.zeros(1, np.uint64)}
-"""What `robust` needs besides a pose."""
+"""Further contents of a message of `robust`."""
 
 
 @pytest.mark.parametrize(("observer", "extra"), [("riccati", {}), ("mekf", {}), ("robust", SAID)])

@@ -66,7 +66,7 @@ def test_truth_is_planar(recording):
 
 
 def test_bearings_are_turned_to_the_tick(recording):
-    """What the camera would have seen at the tick, but for the little that the robot drove since the frame."""
+    """View of the camera at the tick, but for the short distance driven since the frame."""
     seen = recording.visible[:, :, : recording.setups[0].landmarks]
     assert seen.any(axis=(0, 2)).all()
     worst = 0.0

@@ -102,7 +102,7 @@ def test_actions_are_recorded_once(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_actions_of_a_driver_are_played_back() -> None:
-    """Those of `peek` now, rounded, lead to the record that they are from."""
+    """The present actions of `peek`, rounded, lead to their own record."""
     [scene] = Frozen("v1").scenes(["facade"])
     driver = freeze.Rounded(scene, 1000)
     first = record(driver.scenario, 1000, driver)

@@ -62,7 +62,7 @@ def test_messages_of_other_detectors_are_read_live(kind: str) -> None:
 
 
 def test_messages_of_ros_1_and_of_the_authors_are_read_in_bags() -> None:
-    """Those of which coopenv has no definition: hypothesis and centre are not nested, but the marker is."""
+    """Types without a definition in coopenv: hypothesis and centre are not nested, but the marker is."""
     square = {"size_x": 20.0, "size_y": 20.0}
     boxes = [
         Fields(results=[Fields(id=12, score=0.2), Fields(id=n, score=0.9)], bbox=Fields(center=xyz(*pixel), **square))

@@ -1,4 +1,4 @@
-"""How hostile input is taken, and what an environment does with it."""
+"""Treatment of hostile input, and its effect on an environment."""
 
 from __future__ import annotations
 

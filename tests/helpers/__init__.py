@@ -1,4 +1,4 @@
-"""What tests share: scenarios and worlds from plain data, callers of Warp functions, recordings, files, runs."""
+"""Common parts of tests: scenarios and worlds from plain data, callers of Warp functions, recordings, files, runs."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What commands and parts of tables print."""
+"""Output of commands and parts of tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What has been drawn: bars, lines and words of a figure, read back."""
+"""Contents of a figure, read back: bars, lines and words."""
 
 from __future__ import annotations
 

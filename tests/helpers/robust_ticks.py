@@ -31,7 +31,7 @@ class OpenRobust(KernelObserver):
 
     @property
     def member_numbers(self) -> list[int]:
-        """Which vehicles are members, the vehicle itself first."""
+        """The members, the vehicle itself first."""
         return [self.setup.vehicle, *self.others["vehicle"].tolist()]
 
     @property

@@ -1,4 +1,4 @@
-"""What is no estimate or no message is refused in one line that names the field."""
+"""Invalid estimates and messages are refused in one line that names the field."""
 
 from __future__ import annotations
 

@@ -271,7 +271,7 @@ def test_odometry_s_variance_is_that_of_what_is_recorded() -> None:
     "name", ["mekf", "covariance_intersection", "split_covariance_intersection", "pairwise", "ukf"]
 )
 def test_ticks_of_other_types_are_as_good(name: str) -> None:
-    """What a user's own source of ticks may give: whole numbers, single precision, lists."""
+    """Valid types of a user's own source of ticks: whole numbers, single precision, lists."""
     made = small_record(3)
     factory = find(name)
     estimates = []

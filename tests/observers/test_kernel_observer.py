@@ -167,7 +167,7 @@ def test_the_kernels_know_no_truth() -> None:
 
 @wp.struct
 class Counter:
-    """What the toy remembers."""
+    """Memory of the toy observer."""
 
     ticks: array("WN", wp.int32)
     heard: array("WN", wp.int32)

@@ -79,7 +79,7 @@ def test_a_follower_is_a_joint_filter_that_never_corrects_its_leader(name: str) 
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_messages_of_any_content_leave_a_pose(name: str) -> None:
-    """What a liar tells of itself fits no cross-covariance; what is malformed is not used."""
+    """A lying sender's pose fits no cross-covariance; malformed messages are not used."""
     made = small_record(8)
     leader, own = pair(name, made)
     for k in range(1, 8):

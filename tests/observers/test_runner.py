@@ -1,4 +1,4 @@
-"""What an observer is given, when, and what becomes of what it returns."""
+"""Inputs of an observer, their times, and the use of its results."""
 
 from __future__ import annotations
 

@@ -165,7 +165,7 @@ def test_evo_measures_the_same_errors(tmp_path: Path) -> None:
 
 
 class Ended(BaseException):
-    """What a kill is to a command."""
+    """Stand-in for a kill of a command."""
 
 
 SHORT = ["overtaking", "--set", "horizon=0.5"]

@@ -1,4 +1,4 @@
-"""What a scenario file may say: each mistake is one line that names the field, and the nearest valid word."""
+"""Contents of a scenario file: each mistake is one line that names the field, and the nearest valid word."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ CUT = """() => {
     }
     return found.slice(0, 3);
 }"""
-"""What of the text a reader cannot get to: wide tables and code scroll in boxes of their own."""
+"""Text outside the window: wide tables and code scroll in boxes of their own."""
 SPLIT = """() => [...document.querySelectorAll('article :is(.option, .quantity, .numbers)')]
     .filter(part => {
         const range = document.createRange();

@@ -44,7 +44,7 @@ def test_there_is_a_page_of_every_observer_agent_and_environment(made: dict[str,
     ("front", "observations"), [("README.md", "docs/terms.md"), ("docs/index.md", "docs/reference/observation.md")]
 )
 def test_what_people_come_for_is_one_click_away(front: str, observations: str) -> None:
-    """How to plug in an observer, train, open a bag, drive cars, and what the entries of an observation mean."""
+    """Pages on observers, training, bags and cars, and the meaning of an observation's entries."""
     text = (ROOT / front).read_text(encoding="utf-8")
     led_to = {target.partition("#")[0] for target in LINK.findall(text)}
     found = {(Path(front).parent / target).as_posix() for target in led_to}

@@ -1,4 +1,4 @@
-"""What a camera sees, against plain geometry on random scenes, and what it measures: pixels, distortion, noise."""
+"""Visibility, against plain geometry on random scenes, and measurements: pixels, distortion, noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a world draws at a reset beside routes: landmarks, who is there, at which pace, factors of parameters."""
+"""Draws of a world at a reset beside routes: landmarks, presence, pace, factors of parameters."""
 
 from __future__ import annotations
 

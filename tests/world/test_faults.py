@@ -258,7 +258,7 @@ def test_jammers_and_restarts_are_drawn(fault: str, options: dict[str, float], d
 
 
 def test_others_go_on_as_if_there_were_no_fault() -> None:
-    """Who hears nobody that has one has the same bits, and so has everybody where faults are off."""
+    """A vehicle that receives no faulty sender has the same bits, and so have all vehicles with faults off."""
     faults = {
         "clock_offset": 0.2,
         "corruption": {"probability": 0.5},

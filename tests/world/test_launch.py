@@ -242,7 +242,7 @@ except CoopenvError as error:
     print("error:", error)
 """
 DONE = "[0.0, 2.0, 4.0]\n"
-"""What the program prints."""
+"""Output of the program."""
 
 
 def double(x: wp.array(dtype=Any)):

@@ -1,4 +1,4 @@
-"""What is near: bodies in cells of the grid, against all pairs; vehicles that keep those nearby, and their memory."""
+"""Neighbourhood: bodies in cells of the grid, against all pairs; vehicles that keep those nearby, and their memory."""
 
 from __future__ import annotations
 

@@ -287,7 +287,7 @@ def test_a_longer_focal_length_spreads_the_image() -> None:
 
 
 def test_a_pinhole_s_view_is_that_of_its_true_focal_length() -> None:
-    """What is seen of a target falls into the image of (1 + e) f, and back through f."""
+    """Bearings pass through the image of (1 + e) f, and back through f."""
     camera = {"model": "pinhole", "focal_length_error": 0.3, "orientation": "forward"}
     made = scenario([vehicle(motion=TURNING)], camera=camera, topology={"mode": "sensed"})
     state = start(made, range(500)).get_state()

@@ -321,7 +321,7 @@ def test_standing_neither_adds_nor_forgets() -> None:
 
 
 def test_a_fast_vehicle_forgets_the_blocks_that_it_skips() -> None:
-    """What it sees lasts for no more than the window, though a sample is longer than a block."""
+    """Information lasts for the window at most, though a sample is longer than a block."""
     engine = engine_of(observer__gramian_distance=0.1)  # blocks of 1 cm, samples of up to 5 cm
     for _ in range(20):
         engine.step(np.array([[[1.0, 0.0]] * 4]))

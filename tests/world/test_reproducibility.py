@@ -97,7 +97,7 @@ BOTH = [
     *product(["riccati", "robust"], DTYPES),
     *product(["robust, errors that last", "all that is drawn"], ["float64"]),
 ]
-"""What is run, and in which precision."""
+"""Cases and their precision."""
 
 
 def played(world: World, ticks: int = 300) -> State:

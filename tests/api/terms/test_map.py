@@ -206,7 +206,7 @@ def test_deviations_are_those_of_the_covariance_that_the_observer_states() -> No
 
 
 def nearness(ego: Any, landmark: Any) -> Any:
-    """How near a landmark is that the camera has in view, 0 if it has not."""
+    """Closeness of a landmark in the camera's view, 0 if out of view."""
     if landmark.in_view and landmark.exists:
         return 1.0 / (1.0 + landmark.distance)
     return 0.0
@@ -298,7 +298,7 @@ TIMES = np.linspace(0.0, 6.0, 3001)
 
 
 def test_clearance_is_the_least_distance_on_the_two_ways_that_are_expected() -> None:
-    """How near a heard vehicle will come, against places at many instants."""
+    """Closest approach of a received vehicle, against positions at many instants."""
     wide = {"position_scale": 50.0, "scales": {"route_ahead": 3.2}, "include": ["messages", "clearance", "route"]}
     scenario = load_scenario("urban_crossing", {f"observation.{key}": value for key, value in wide.items()})
     engine = Engine(scenario, WORLDS, "float64")

@@ -50,7 +50,7 @@ def driver(name: str, scenario: Scenario) -> Any:
 
 
 class Drive(NamedTuple):
-    """What one driver came to: arrays (steps, worlds, vehicles), and which of these count."""
+    """Results of one driver: arrays (steps, worlds, vehicles), and flags of the entries that count."""
 
     counts: np.ndarray
     terms: dict[str, np.ndarray]

@@ -182,7 +182,7 @@ def test_tables_fit_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_large_numbers_fit_as_well() -> None:
-    """Those of an observer that diverges and sends a lot."""
+    """Results of an observer that diverges and broadcasts much."""
     comparison = compare(["covariance_intersection"], "overtaking", 1, overrides={"horizon": 0.5}, steady_from=0.2)
     (sample,) = comparison.samples
     wild = {"position_mse": 12345.6**2, "anees": 1.3e-11, "nis": 2814.3e3, "nis_dof": 1e3, "diverged": 1.0}

@@ -1,4 +1,4 @@
-"""What `coopenv.compare` takes and gives: figures by hand, tables, pictures, files."""
+"""Arguments and results of `coopenv.compare`: figures by hand, tables, pictures, files."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def sample(role: Role, stamp: int, value: Value, car: str = "car0", delay: int =
 
 
 class Senses:
-    """What the sensors of a car on a path tell, each at its own pace and with its own delay."""
+    """Messages of the sensors of a car on a path, each at its own pace and with its own delay."""
 
     def __init__(self, path: Path, until: float) -> None:
         self.path = path

@@ -339,7 +339,7 @@ def test_another_recording_that_is_cut_off_names_what_mends_it(recorded: Any, tm
 
 
 def test_rewards_of_own_actions_alone_are_not_those_of_the_drive(recorded: Any) -> None:
-    """What docs/cars_records.md says: `control` and `last_action` are those of whoever acts at the replay."""
+    """As in docs/cars_records.md: `control` and `last_action` belong to the policy of the replay."""
     outcomes = []
     for action in (np.zeros(2), np.array([0.5, -0.5])):
         env = coopenv.parallel_env(recorded[0], dtype="float64", overrides={"reward.weights.control": 1.0})

@@ -1,4 +1,4 @@
-"""What messages of sensors are read as, and rays through a lens."""
+"""Readings of sensors' messages, and rays through a lens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What must not change an estimate: the map's axes and origin, the names of vehicles, a mirror, the frame rate."""
+"""Invariances of an estimate: the map's axes and origin, the names of vehicles, a mirror, the frame rate."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.helpers.robust_worlds import noise_free, small_errors, watched
 TURN, SHIFT = Rotation.from_rotvec([0.4, -0.7, 2.0]).as_matrix(), np.array([30.0, -80.0, 7.0])
 MIRROR = np.diag([1.0, -1.0, 1.0])
 AXIAL = -MIRROR
-"""How a mirror changes an axis of rotation."""
+"""Effect of a mirror on an axis of rotation."""
 
 
 def turned(recording: Recording, R: np.ndarray, t: np.ndarray) -> Recording:

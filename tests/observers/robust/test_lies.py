@@ -101,7 +101,7 @@ def from_odometry_to_map(pose: np.ndarray, odometry: np.ndarray) -> np.ndarray:
 def test_the_odometry_of_a_consistent_liar_leads_where_its_poses_do(
     faults: dict[str, Any], low: float, high: float
 ) -> None:
-    """That of an honest one, and of messages altered on the way, does not."""
+    """The dead reckoning of an honest sender, and of messages altered on the way, does not."""
     world = simulate(scene(overrides={"vehicles.vehicle_2.faults": faults}), 1)
     reset(world, [5])
     world.advance(60)
@@ -194,7 +194,7 @@ def errors_beside(sender: int, start: float, seed: int, horizon: float, altered:
 
 @pytest.mark.parametrize("sender", rest_slow([1, 3], 0))
 def test_altered_messages_of_one_sender_lead_nobody_astray(sender: int) -> None:
-    """Whether they count or not; others see two honest targets besides."""
+    """The messages may count or not; the other vehicles see two honest targets besides."""
     assert errors_beside(sender, 6.0, 2, 14.0, True).max() < 0.8
 
 

@@ -47,7 +47,7 @@ def all_lost(name: str, seconds: float) -> Scenario:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a scene went."""
+    """Results of a scene."""
 
     settled: np.ndarray
     """(W, N) s, from which on the estimate is within 0.5 m and 5 degrees; infinite where it is not in the end."""

@@ -40,7 +40,7 @@ class Station:
 
     @property
     def present(self) -> bool:
-        """Whether the car is there."""
+        """True if the car is present."""
         return dict(self._seen).get(presence_of(CAR), False)
 
     def since(self, when: float = 0.0) -> list[MotionCommand]:

@@ -1,4 +1,4 @@
-"""What the gate lets through, and what it does when nothing comes."""
+"""Commands that pass the gate, and its actions without commands."""
 
 from __future__ import annotations
 

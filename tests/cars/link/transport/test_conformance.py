@@ -1,4 +1,4 @@
-"""What every network does alike, and the names and types of the authors' topics."""
+"""Common behaviour of all networks, and the names and types of the authors' topics."""
 
 from __future__ import annotations
 
