@@ -177,8 +177,10 @@ ELSEWHERE = {
     "make": "parallel_env",
     "num_envs": "num_worlds",
     "plot": "figure",
+    "n_episodes": "worlds",
     "save": "to_csv",
     "seed": "reset",
+    "seeds": "worlds",
     "set": "overrides",
     "to_dict": "model_dump",
     "to_json": "model_dump_json",
@@ -195,6 +197,9 @@ def suggest(word: str, valid: Iterable[str]) -> str:
     return f" (did you mean '{known[near[0]]}'?)" if near else ""
 
 
+_PARTS = ("scenario", "trajectory")  # attributes with attributes that are looked for in their owner
+
+
 class Explained:
     """Raises an error that lists the attributes if one is missing."""
 
@@ -205,7 +210,9 @@ class Explained:
             if hasattr(type(self), name):
                 return object.__getattribute__(self, name)  # an error within a property
             public = [] if name.startswith("_") else [known for known in dir(self) if not known.startswith("_")]
-            known = f"{suggest(name, public)}; known: {listed(public)}" if public else ""
+            parts = [f"{part}.{name}" for part in _PARTS if public and hasattr(vars(self).get(part), name)]
+            near = f" (did you mean '{parts[0]}'?)" if parts else suggest(name, public)
+            known = f"{near}; known: {listed(public)}" if public else ""
             raise AttributeError(f"{type(self).__name__} has no attribute '{name}'{known}")
 
 

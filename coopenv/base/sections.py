@@ -19,6 +19,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from coopenv.base.errors import CoopenvError, check_one_of, listed, shortened, shown, suggest
 
 CHANGE = "scenario | {'dotted.key': value} returns a changed scenario"
+_METHODS = ("figure", "model_dump", "model_dump_json")
 MOST_BYTES = 8 * 2**20  # of a file; 20,000 landmarks take one or two million
 
 
@@ -57,7 +58,7 @@ class Section(BaseModel):
                 return super().__getattr__(name)
             except AttributeError:
                 keys = [] if name.startswith("_") else [*type(self).model_fields]
-                near = suggest(name, [*keys, "model_dump", "model_dump_json"])
+                near = suggest(name, [*keys, *(m for m in _METHODS if hasattr(type(self), m))])
                 known = f"{near}; keys: {listed(keys, 40)}; {CHANGE}, model_dump() data" if keys else ""
                 raise AttributeError(f"{type(self).__name__} has no attribute '{name}'{known}") from None
 

@@ -22,7 +22,7 @@ from coopenv.base.columns import WIDTH, Columns, Tabular, one_line, picture_html
 from coopenv.base.errors import ActionError, CoopenvError, check_one_of, checked_seed
 from coopenv.base.files import check_file, replace_text
 from coopenv.base.format import NONE, json_text
-from coopenv.base.installation import version
+from coopenv.base.installation import load_reference, version
 from coopenv.base.terminal import text_of
 from coopenv.evaluation import METRICS, Difference, Episodes, Result, compare_paired, drive, held_out_seeds, score
 from coopenv.policies import Agent, Policy, agents_for, find_agent
@@ -82,8 +82,12 @@ def stress(scenario: Scenario) -> dict[str, dict[str, Any]]:
     }
 
 
-KINDS: "dict[str, Callable[[Evaluation, float | None], Figure]]" = {}
-"""Functions that draw the figures of an evaluation, which `evaluate` adds."""
+KINDS = {
+    "error_along_the_way": "coopenv.bench.evaluate:error_figure",
+    "time_against_error": "coopenv.bench.evaluate:pareto_figure",
+    "looking": "coopenv.bench.evaluate:looking_figure",
+}
+"""Functions that draw the figures of an evaluation, loaded when drawn: their module imports this one."""
 
 
 @dataclass(frozen=True)
@@ -244,7 +248,7 @@ class Evaluation(Contest, Tabular):
         from coopenv.viz import figures, style
 
         check_one_of("unknown figure", kind, KINDS)
-        drawn = KINDS[kind](self, figures.inches_of(width))
+        drawn: Figure = load_reference(KINDS[kind])(self, figures.inches_of(width))
         if isinstance(width, str):
             figures.restyle(drawn, width)
         if path is not None:

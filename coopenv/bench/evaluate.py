@@ -228,9 +228,6 @@ def looking_figure(evaluation: Evaluation, width: float | None = None) -> Figure
     return figure
 
 
-KINDS |= {"error_along_the_way": error_figure, "time_against_error": pareto_figure, "looking": looking_figure}
-
-
 def _radius(share: np.ndarray) -> np.ndarray:
     """Return decades above the rarest share that is drawn; 0 below it."""
     return np.asarray(np.log10(np.maximum(share, _RAREST) / _RAREST))

@@ -32,15 +32,19 @@ isotropic. As in the theorem, neighbours count as known, and lambda and p are ab
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Self, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self, get_type_hints
 
 import numpy as np
 
-from coopenv.base.columns import Columns, Tabular, facts_html, one_line
+from coopenv.base.columns import Columns, Tabular, facts_html, one_line, picture_html
 from coopenv.base.errors import DataError, check_one_of
 from coopenv.base.files import replacing_file
 from coopenv.base.format import read_npz
+from coopenv.base.installation import load_reference
 from coopenv.estimation.poses import Array, error_dof, position_covariance, roll_pitch_yaw_deg, skew
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DEFAULT_WINDOW = 1.0
 DEFAULT_THRESHOLD = 1e-4
@@ -135,7 +139,13 @@ class Trajectory(RecordedGeometry, Tabular):
 
     def _repr_html_(self) -> str:
         arrays = {name: f"{(array := getattr(self, name)).dtype} {array.shape}" for name in self.kinds()}
-        return facts_html(repr(self), arrays)
+        picture = picture_html(self.figure(width=6.0)) if self.with_truth(range(len(self.vehicles))) else ""
+        return facts_html(repr(self), arrays) + picture
+
+    def figure(self, kind: str = "trajectories_2d", **options: Any) -> "Figure":
+        """Return a figure of `coopenv.viz.FIGURE_NAMES`; options and errors as of `coopenv.viz.figures.draw_figure`."""
+        drawn: Figure = load_reference("coopenv.viz.figures:draw_figure")(kind, self, **options)  # which stand on this
+        return drawn
 
     def where_truth_is_known(self) -> Self:
         """Return the ticks at which every vehicle's true pose is known, as it may not be in a recording."""

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from shlex import quote
 from textwrap import fill
@@ -150,7 +151,7 @@ def _kept_if_failed(record: RunRecord | None, out: Path | None, name: str, log: 
         raise
 
 
-@explained
+@partial(explained, hint="; several seeds or observers: coopenv.compare")
 def run(
     environment: ScenarioLike,
     seed: int = 0,
@@ -331,11 +332,31 @@ class Results(Tabular):
         """Start of the steady state, s."""
         return float(self.metrics["steady_from_s"])
 
-    def figure(self, kind: str = "errors", *, width: str | float | None = None) -> "Figure":
-        """Return a figure of `coopenv.viz.FIGURE_NAMES`; width and errors as of `coopenv.viz.figures.draw_figure`."""
-        from coopenv.viz.figures import draw_figure
+    def figure(
+        self,
+        kind: str = "errors",
+        *,
+        width: str | float | None = None,
+        path: str | Path | None = None,
+        format: str | None = None,
+    ) -> "Figure":
+        """Draw a figure of `coopenv.viz.FIGURE_NAMES`, and write it where a path is given.
 
-        return draw_figure(kind, self.trajectory, width=width, **self._drawn)
+        Width, path, format and errors are those of `Comparison.figure`.
+        """
+        from coopenv.viz.figures import draw_figure
+        from coopenv.viz.style import save
+
+        drawn = draw_figure(kind, self.trajectory, width=width, **self._drawn)
+        if path is not None:
+            save(drawn, Path(path), format or "", about=self._about)
+        return drawn
+
+    @property
+    def _about(self) -> dict[str, Any]:
+        """Metadata of the files of figures."""
+        names = ("environment", "observer", "seed", "policy", "overrides")
+        return {"coopenv": self.metrics["versions"]["coopenv"], **{name: self.metrics[name] for name in names}}
 
     @property
     def _drawn(self) -> dict[str, Any]:
@@ -358,14 +379,14 @@ class Results(Tabular):
         """
         from coopenv.viz.figures import save_figures
 
-        about = {name: self.metrics[name] for name in ("environment", "observer", "seed", "policy", "overrides")}
+        about = self._about
         note = f"{about['environment']}, {about['observer']}, seed {about['seed']}" if width is None else ""
         return save_figures(
             self.trajectory,
             folder,
             observability,
             file_format=file_format,
-            about={"coopenv": self.metrics["versions"]["coopenv"], **about},
+            about=about,
             width=width,
             note=note,
             **self._drawn,

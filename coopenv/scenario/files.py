@@ -59,6 +59,8 @@ def load_scenario(name_or_path: ScenarioLike, overrides: Mapping[str, Any] | Non
         return parse_scenario(located(raw, Path.cwd()), OVERRIDES)
     if not isinstance(name_or_path, str | Path | Mapping):
         kind = type(name_or_path).__name__
+        has_one = isinstance(getattr(name_or_path, "scenario", None), Scenario)
+        kind += " (did you mean its attribute scenario?)" if has_one else ""
         raise ScenarioError(f"environment: expected a name, a path, a dict of its keys or a Scenario, got {kind}")
     path = Path("scenario")
     try:

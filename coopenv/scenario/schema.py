@@ -10,14 +10,18 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from coopenv.base.columns import facts_html, one_line
+from coopenv.base.columns import facts_html, one_line, picture_html
 from coopenv.base.errors import ScenarioError, ScenarioWarning, check_one_of, listed, shown, suggest
+from coopenv.base.installation import load_reference
 from coopenv.base.sections import Positive, Section, Text, Vector3, overlaid, validated
 from coopenv.scenario.bodies import Landmark, LandmarkGroup, Obstacle, Road, Vehicle
 from coopenv.scenario.cosimulators import COSIMULATORS, Cosimulator, Highway, Program, Sumo
 from coopenv.scenario.learning import Action, Difficulty, Dynamics, Observation, Randomisation, Reward, Termination
 from coopenv.scenario.routes import Boxes, Route, followers, overlapping_pairs, possible_boxes, start_of
 from coopenv.scenario.sensing import Camera, Faults, Noise, ObserverSettings, Rates, Topology, V2x, rotation_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MOST_TICKS = 1e8  # camera frames or odometry samples of one episode; counters are 32 bits wide
 
@@ -122,8 +126,14 @@ class Scenario(Section, metaclass=_Loaded):
 
     __str__ = __repr__
 
+    def figure(self) -> "Figure":
+        """Return the top view of the world before an episode, for a notebook or `figure().savefig(...)`."""
+        drawn: Figure = load_reference("coopenv.viz.topview_ground:site_figure")(self)  # pictures stand on scenarios
+        return drawn
+
     def _repr_html_(self) -> str:
-        return facts_html(self.title, {"description": self.description, **self.facts})
+        facts = {"description": self.description, **self.facts}
+        return facts_html(self.title, facts) + picture_html(self.figure())
 
     @property
     def paced(self) -> bool:

@@ -151,16 +151,16 @@ def limits(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     for group in scenario.landmark_groups:
         for corner, first, second in group.parallelograms:
             around.append(np.array([corner, np.add(corner, first), np.add(corner, second)]) - origin)
-    points = np.concatenate([*around, *roads(scenario), *_paths(scenario)])
+    points = np.concatenate([*around, *roads(scenario), *paths(scenario)])
     low, high = points.min(axis=0), points.max(axis=0)
     half = (0.5 + _MARGIN) * max(1.0, float((high - low).max()))
     return (low + high) / 2 - half, (low + high) / 2 + half
 
 
-def _paths(scenario: Scenario) -> list[np.ndarray]:
-    """Return points (K, 2) along the prescribed motion of every agent, or its start."""
+def paths(scenario: Scenario) -> list[np.ndarray]:
+    """Return points (K, 2) along the prescribed motion of every agent, or its nominal start; landmarks first."""
     agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
-    paths = []
+    found = []
     for agent, position, rotation in zip(agents, *agent_starts(scenario), strict=True):
         table = compile_motion(agent.motion, rotation, scenario.horizon)
         t = np.linspace(0.0, scenario.horizon, 1 if agent.motion.kind in _UNKNOWN else _PATH_SAMPLES)
@@ -168,8 +168,8 @@ def _paths(scenario: Scenario) -> list[np.ndarray]:
         h = (t - table.start[segment])[:, None]
         step = left_jacobian(table.angular[segment] * h) @ (table.linear[segment] * h)[..., None]
         relative = table.position[segment] + (table.rotation[segment] @ step)[..., 0]
-        paths.append((position + relative @ rotation.T)[:, :2])
-    return paths
+        found.append((position + relative @ rotation.T)[:, :2])
+    return found
 
 
 def roads(scenario: Scenario) -> list[np.ndarray]:

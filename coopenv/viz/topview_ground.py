@@ -14,13 +14,16 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation, Text
+from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import Sight
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
+from coopenv.scenario.routes import even_points
+from coopenv.scenario.schema import agent_starts
 from coopenv.viz import style
 from coopenv.viz.scene import Frame
-from coopenv.viz.stage import Stage, roads, vehicle_mark, ways
+from coopenv.viz.stage import CORNERS, Stage, nose_shapes, outlines, paths, roads, vehicle_mark, ways
 from coopenv.viz.style import (
     DARK_BLUE,
     DPI,
@@ -47,6 +50,7 @@ MOST_ROWS = 16
 SWATCH = 8  # px
 HALO = (withStroke(linewidth=2.2, foreground="white"),)
 _RIM = 0.9  # pt, of marks
+_LENGTH = 0.04  # of the side of the map, least length of a vehicle before an episode
 LARGEST_ELLIPSE = 0.3  # of the side of the map, semi-axis of an ellipse that is drawn
 
 GROUND, ASPHALT, WALL, ROOF, TRAFFIC = "#F4F2EC", "#E2E2E2", "#8A8172", "#C9C2B4", "#6E6E6E"
@@ -94,6 +98,45 @@ def draw_site(ax: Axes, stage: Stage) -> None:
             ax.plot(*line.T, color="white", linewidth=1.2, linestyle=(0, (7, 6)), zorder=0.6)
     for *_, top in (box.faces for box in stage.buildings):
         ax.add_patch(Polygon(top[:, :2], facecolor=ROOF, edgecolor=WALL, linewidth=1.2, hatch="//", zorder=1))
+
+
+def site_figure(scenario: Scenario) -> Figure:
+    """Draw the top view before an episode: nominal places, routes, and prescribed motions."""
+    stage = Stage(scenario)
+    figure, ax = new_ground(stage)
+    fixed = np.array([not landmark.is_drawn for landmark in scenario.landmarks], bool)
+    single = np.array([landmark.group is None and landmark.is_drawn for landmark in scenario.landmarks], bool)
+    corners = [shape for group in scenario.landmark_groups for shape in group.parallelograms]
+    areas = [np.array([c, c + u, c + u + v, c + v])[:, :2] - stage.origin[:2] for c, u, v in np.array(corners)]
+    areas_look: dict[str, Any] = {"facecolor": "#00264D40", "edgecolor": DARK_BLUE, "linewidth": 0.9}
+    ax.add_collection(PolyCollection(areas, **areas_look), autolim=False)
+    along = paths(scenario)
+    start, turn = np.array([path[0] for path in along]), agent_starts(scenario)[1][stage.landmarks :]
+    colours = [vehicle_colour(i) for i in range(stage.vehicles)]
+    routes = [even_points(route)[:, :2] - stage.origin[:2] for route in scenario.routes]
+    ax.add_collection(LineCollection(routes, color=GREY, linewidth=0.9, zorder=0.7), autolim=False)
+    ax.add_collection(LineCollection(along[stage.landmarks :], colors=colours, linewidth=1.1), autolim=False)
+    looks = [mark_look("o", DARK_BLUE, face, 5.5, _RIM) for face in (DARK_BLUE, "white")]
+    for look, chosen in zip(looks, (fixed, single), strict=True):
+        ax.plot(*start[: stage.landmarks][chosen].T, **look)
+    name_landmarks(ax, scenario)
+    size, centre = stage.bodies(_LENGTH * stage.side)
+    shapes = centre[:, None, :2] + size[:, None, :2] / 2 * CORNERS
+    turn = Rotation.from_euler("z", ways(scenario)[:, None]).as_matrix() @ turn
+    for part, face in ((shapes, colours), (nose_shapes(shapes), "white")):
+        shown = PolyCollection(list(outlines(turn, start[stage.landmarks :], part)), facecolors=face)
+        ax.add_collection(shown, autolim=False)
+    marks = style.marks(
+        (True, "vehicle, nominal start", {"facecolor": GREY}),
+        (fixed.any(), "landmark", looks[0]),
+        (single.any(), "landmark drawn at reset", looks[1]),
+        (areas, "area of drawn landmarks", areas_look),
+        (routes, "route", {"color": GREY, "linewidth": 0.9}),
+        (any(len(path) > 1 for path in along), "prescribed motion", {"color": GREY, "linewidth": 1.1}),
+        (scenario.obstacles, "building", {"facecolor": ROOF, "edgecolor": WALL, "hatch": "//"}),
+    )
+    legend(figure, marks, "upper left", pixels(PANEL - 4, TABLE_TOP))
+    return figure
 
 
 def name_landmarks(ax: Axes, scenario: Scenario) -> list[Annotation]:

@@ -38,17 +38,18 @@ PRECISIONS = {"float32": _precision(wp.float32), "float64": _precision(wp.float6
 
 
 def precision(dtype: object) -> Precision:
-    """Return the types for `float32` or `float64`, by name or as a type of NumPy. Raises DeviceError: another one."""
-    dtype = str(getattr(dtype, "__name__", dtype))
+    """Return the types for a name or type of NumPy or torch. Raises DeviceError: neither `float32` nor `float64`."""
+    dtype = str(getattr(dtype, "__name__", dtype)).removeprefix("torch.")
     if dtype not in PRECISIONS:
         raise DeviceError(f"unknown dtype '{dtype}'{suggest(dtype, PRECISIONS)}; known: float32, float64")
     return PRECISIONS[dtype]
 
 
-def check_device(device: str) -> str:
-    """Return the device's canonical name. Raises DeviceError: Warp knows no such device here."""
+def check_device(device: object) -> str:
+    """Return the canonical name of a device, by name or of torch. Raises DeviceError: Warp has no such device here."""
     start_warp()
-    if not isinstance(device, str) or device.split(":")[0] not in ("cpu", "cuda"):
+    device = str(device)
+    if device.split(":")[0] not in ("cpu", "cuda"):
         raise DeviceError(f"unknown device '{device}'; known: cpu, cuda, cuda:0, ...")
     if device.startswith("cuda") and not wp.is_cuda_available():
         raise DeviceError(f"device '{device}' asked for, but no CUDA device is available here; use device='cpu'")

@@ -88,6 +88,18 @@ def test_an_environment_prints_copies_pickles_and_closes() -> None:
     env.reset(seed=3)
 
 
+@pytest.mark.parametrize("name", ["facade", "lane:20", "take_turns", "crossing_path"])
+def test_a_scenario_has_a_picture(name: str) -> None:
+    scenario = coopenv.load_scenario(name)
+    assert "data:image/png;base64," in scenario._repr_html_()
+    map_of = scenario.figure().axes[0]
+    starts = map_of.collections[-2]
+    assert len(starts.get_paths()) == len(scenario.vehicles)  # type: ignore[attr-defined]
+    low, high = np.array([map_of.get_xlim(), map_of.get_ylim()]).T
+    for path in starts.get_paths():  # type: ignore[attr-defined]
+        assert (path.vertices > low).all() and (path.vertices < high).all()
+
+
 def test_an_observation_without_an_entry_is_refused() -> None:
     with pytest.raises(coopenv.CoopenvError, match=r"^observation.include: seen without an entry here; add a group"):
         coopenv.parallel_env("facade", overrides={"observation.include": ["seen"]})
@@ -117,12 +129,14 @@ def test_infos_have_the_entries_that_their_type_names() -> None:
 
 
 def test_figures_show_in_notebooks_that_have_not_loaded_pyplot(scenario: Scenario) -> None:
-    figure: Any = coopenv.run(scenario, seed=4).figure()
-    assert "data:image/png;base64," in figure._repr_html_()
+    results = coopenv.run(scenario, seed=4)
+    for figure in (results.figure(), results.trajectory.figure("errors")):
+        assert "data:image/png;base64," in figure._repr_html_()  # type: ignore[attr-defined]
 
 
 def test_types_of_numpy_are_precisions() -> None:
     assert coopenv.parallel_env(ENV, dtype=np.float64).engine.world.precision.name == "float64"  # type: ignore[arg-type]
+    assert coopenv.make_vec(ENV, num_worlds=1, dtype="torch.float64").engine.world.precision.name == "float64"
     with pytest.raises(coopenv.DeviceError, match=r"^unknown dtype 'float16' \(did you mean 'float\d\d'\?\)"):
         coopenv.make_vec(ENV, num_worlds=1, dtype="float16")
 
@@ -197,6 +211,10 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "a dash": (lambda: coopenv.make_vec("urban-crossing", num_worlds=1), r"did you mean 'urban_crossing'\?"),
     "None": (lambda: coopenv.parallel_env(None), "^environment: expected a name.*got NoneType"),  # type: ignore[arg-type]
     "arguments in turn": (lambda: coopenv.compare(ENV, "robust"), "'robust' is an observer; observers come first"),
+    "an environment": (
+        lambda: coopenv.run(coopenv.parallel_env(ENV)),  # type: ignore[arg-type]
+        r"got CooperativeLocalisationEnv \(did you mean its attribute scenario\?\)$",
+    ),
     "a list": (lambda: coopenv.compare(["riccati"], [ENV]), "^environment: .* got list"),  # type: ignore[arg-type]
     "a set attribute": (
         lambda: setattr(coopenv.load_scenario(ENV), "horizon", 3.0),
@@ -288,7 +306,8 @@ WRONG_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         r"'horizon'; known: name_or_path, .*; keys of a scenario are given in overrides$",
     ),
     "an option of the shell": (lambda: coopenv.run(ENV, set={}), r"^run: .*'set' \(did you mean 'overrides'\?\)"),  # type: ignore[call-arg]
-    "seeds": (lambda: coopenv.run(ENV, seeds=3), r"^run: .*'seeds' \(did you mean 'seed'\?\)"),  # type: ignore[call-arg]
+    "seeds": (lambda: coopenv.run(ENV, seeds=3), r"^run: .*; several seeds or observers: coopenv\.compare$"),  # type: ignore[call-arg]
+    "seeds of held-out worlds": (lambda: coopenv.evaluate(ENV, seeds=3), r"did you mean 'worlds'"),  # type: ignore[call-arg]
     "through Gymnasium": (lambda: gymnasium.make("coopenv/Facade-v0", observr="mekf"), r"did you mean 'observer'\?"),
     "render as in OpenAI Gym": (
         lambda: coopenv.parallel_env(ENV).render("human"),
@@ -323,6 +342,11 @@ ABSENT: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: coopenv.parallel_env(ENV).seed(3),
         r"no attribute 'seed' \(did you mean 'reset'\?\); known: action_space,",
     ),
+    "key of the scenario": (
+        lambda: coopenv.parallel_env(ENV).horizon,
+        r"\(did you mean 'scenario\.horizon'\?\); known",
+    ),
+    "plot of a scenario": (lambda: coopenv.load_scenario(ENV).plot(), r"\(did you mean 'figure'\?\); keys: "),
     "plot": (
         lambda: coopenv.run(ENV, overrides={"horizon": 0.3}).plot(),  # type: ignore[attr-defined]
         r"^Results has no attribute 'plot' \(did you mean 'figure'\?\); known: columns, .*trajectory$",

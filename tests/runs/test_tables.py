@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from scipy.spatial.transform import Rotation
 
 import coopenv
 from coopenv.base.columns import Columns
+from coopenv.base.installation import load_reference
+from coopenv.bench.cards import KINDS
 from coopenv.cli.app import main
 from coopenv.estimation.observability import Trajectory
 from coopenv.runs.command import Results
@@ -44,13 +47,17 @@ def test_a_run_in_python_is_that_of_the_shell(results: Results, tmp_path: Path, 
     assert kept.files == () and kept.metrics["observer"] == "robust"
 
 
-def test_a_run_prints_itself(results: Results) -> None:
+def test_a_run_prints_itself(results: Results, tmp_path: Path) -> None:
     assert repr(results).startswith("Results('four_way', observer='robust', policy='zero', seed=2, outcome=")
     assert "RMSE" in str(results) and "vehicle_4" in str(results)
-    html = results._repr_html_()
+    html, nan = results._repr_html_(), np.full_like(results.trajectory.position, np.nan)
     assert "RMSE" in html and "data:image/png;base64," in html
+    results.figure("topology", path=tmp_path / "topology.svg")
+    assert "four_way" in (tmp_path / "topology.svg").read_text()
     assert repr(results.trajectory) == f"Trajectory('0 to 1 s', ticks=61, vehicles=4, targets={4 + landmarks()})"
-    assert "<td>float64 (61, 4, 3)</td>" in results.trajectory._repr_html_()
+    html = results.trajectory._repr_html_()
+    assert "<td>float64 (61, 4, 3)</td>" in html and "data:image/png;base64," in html
+    assert "<img" not in replace(results.trajectory, position=nan)._repr_html_()  # without truth
 
 
 def landmarks() -> int:
@@ -154,6 +161,7 @@ def test_an_evaluation_in_python(capsys: Any, tmp_path: Path) -> None:
     assert "Facade: 3 held-out worlds" in printed and "e95\n" not in printed
     assert repr(found) == "Evaluation('Facade', agents=('peek', 'route_follower'), worlds=3)"
     assert "held-out worlds" in (html := found._repr_html_()) and "data:image/png;base64," in html
+    assert all(":" in place and callable(load_reference(place)) for place in KINDS.values())  # before `evaluate` loads
     found.figure("looking", width="ieee1", path=tmp_path / "looking.pdf")
     assert (tmp_path / "looking.pdf").is_file()
     with pytest.raises(coopenv.CoopenvError, match=r"unknown figure 'look'.* known: error_along_the_way"):
