@@ -24,7 +24,7 @@ from coopenv.base.errors import (
     UnknownEnvironmentError,
     evaluation_seed,
 )
-from coopenv.base.installation import list_agents, list_envs
+from coopenv.base.installation import list_agents, list_envs, sample_bags
 
 if TYPE_CHECKING:
     from coopenv.api.make import make_vec, parallel_env
@@ -79,6 +79,7 @@ __all__ = [
     "register_reward",
     "register_termination",
     "run",
+    "sample_bags",
 ]
 
 # The command makes environments itself; until it runs, no signal is caught, so that it is to begin at once.

@@ -91,10 +91,10 @@ def test_a_class_name_means_one_class() -> None:
 
 
 LINES_AND_FILES = {
-    ".": (128, 2),
+    ".": (129, 2),
     "api": (4402, 19),
     "backends": (3825, 15),
-    "base": (1904, 10),
+    "base": (1919, 10),
     "bench": (5424, 18),
     "cars": (10964, 41),
     "cli": (2679, 9),

@@ -184,6 +184,7 @@ def test_wheel_contents(wheel: Path) -> None:
     agents = {Path(n).parts[3] for n in names if n.startswith("coopenv/data/agents/") and len(Path(n).parts) > 4}
     assert agents == {path.name for path in (ROOT / "agents").iterdir() if path.is_dir()}
     assert {"overtaking.toml", "crossing.toml"} <= {Path(n).name for n in names if "data/examples/fleet/" in n}
+    assert {"ros1.bag", "mcap.mcap", "topics.toml"} <= {Path(n).name for n in names if "data/examples/bags/" in n}
     tops = {Path(n).parts[0] for n in names}
     assert {t for t in tops if not t.endswith(".dist-info")} == {"coopenv"}
     assert "coopenv/py.typed" in names

@@ -15,11 +15,13 @@ from importlib import import_module, metadata
 from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from shutil import copyfile, copytree, ignore_patterns
 from traceback import extract_tb
 from types import CodeType, ModuleType
 from typing import Any
 
 from coopenv.base.errors import CoopenvError, UnknownEnvironmentError, error_text, shortened, shown, suggest
+from coopenv.base.files import writing
 
 SCENES = ("lane", "roots", "tree", "random", "ring", "road", "crossroad")
 """Kinds of parametric scenes, `lane:20`; see `coopenv.scenario.scenes`."""
@@ -32,11 +34,24 @@ BAGS = (".db3", ".bag")  # suffixes of ROS bags, which are taken for log files b
 def data_directory(kind: str) -> Path:
     """Return the folder of a `kind`, inside the installed wheel, else beside the checkout's package.
 
-    Kinds are `envs`, `agents` and `examples/fleet`.
+    Kinds are `envs`, `agents`, `examples/bags` and `examples/fleet`.
     """
     package = Path(__file__).resolve().parents[1]
     shipped = package / "data" / kind
     return shipped if shipped.is_dir() else package.parent / kind
+
+
+def sample_bags(folder: str | Path = "bags") -> Path:
+    """Copy the sample bags to a folder, which is made if need be, and return its path.
+
+    A drive of two fake cars in three forms, `mcap`, `sqlite3` and `ros1.bag`, and the map of its topics, `topics.toml`.
+
+    Raises:
+        OutputError: the folder cannot be written to.
+    """
+    with writing(folder):
+        source, left_out = data_directory("examples/bags"), ignore_patterns("*.py", "__*")
+        return copytree(source, Path(folder), ignore=left_out, copy_function=copyfile, dirs_exist_ok=True)
 
 
 def install_command(extra: str) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -48,12 +47,10 @@ def blocks(page: Path) -> Iterator[Block]:
 
 
 def prepare(tutorial: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Skip a tutorial whose extra is missing; give others the command and, where it is read, the sample of a clone."""
+    """Skip a tutorial whose extra is missing; give others the command."""
     if tutorial in NEEDS:
         module, extra = NEEDS[tutorial]
         pytest.importorskip(module, reason=f"needs the extra {extra!r}")
-    if tutorial == "logs":
-        shutil.copytree(ROOT / "examples" / "bags", folder / "examples" / "bags")
     tool = folder / "bin" / "coopenv"
     tool.parent.mkdir()
     tool.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m coopenv "$@"\n', encoding="utf-8")

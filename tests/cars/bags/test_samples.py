@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import coopenv
 from coopenv.cars.bags.bag import Bag, cars_of, examined, proposed, role_of
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.log import TopicRow
@@ -25,6 +26,15 @@ TWIST, ODOMETRY, POSE = "geometry_msgs/msg/TwistStamped", "nav_msgs/msg/Odometry
 
 def test_the_samples_are_small() -> None:
     assert sum(file.stat().st_size for file in SAMPLES.rglob("*") if file.is_file()) < 2_000_000
+
+
+def test_the_samples_are_copied(tmp_path: Path) -> None:
+    for _ in range(2):  # a notebook may run its cells again
+        folder = coopenv.sample_bags(tmp_path / "bags")
+        assert {path.name for path in folder.iterdir()} == {*FORMS, "topics.toml"}
+    (tmp_path / "file").touch()
+    with pytest.raises(coopenv.OutputError, match=r"^cannot write to .*file: it is not a folder$"):
+        coopenv.sample_bags(tmp_path / "file")
 
 
 def test_the_samples_hold_the_same_drive_with_its_defects() -> None:
