@@ -105,7 +105,7 @@ LINES_AND_FILES = {
     "runs": (3555, 13),
     "scenario": (3750, 12),
     "training": (1612, 6),
-    "viz": (4868, 16),
+    "viz": (4887, 16),
     "world": (5603, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""

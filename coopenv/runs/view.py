@@ -19,7 +19,7 @@ from coopenv.viz.web_picture import Picture, first_look
 _NAP = 0.05  # s, longest sleep: wishes are not kept waiting longer
 _LAG = 0.5  # s that frames may be late before time is let go
 _FADE_EVERY = 0.25  # s
-_RAISED = 0.7  # of the scene's side, by which it is lifted over the panel at the lower end of a narrow window
+_RAISED = 0.3  # of the scene's side, by which it is lifted over the panel at the lower end of a narrow window
 _NEAR, _LENGTHS = 0.2, 12.0  # share of the first camera's distance from a picked vehicle, or so many of its lengths
 _NARROW = 0.7  # width over height of a window, from which on the camera begins farther away
 

@@ -4,6 +4,7 @@
 """
 
 import errno
+import gzip
 import logging
 import re
 import socket
@@ -77,7 +78,7 @@ def guarded_server(host: str, port: int | None = None) -> Iterator[tuple[Any, st
             reason, path = refusal(request.path, request.headers, token, names)
             if reason:
                 return connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n")
-            return process_request(connection, replace(request, path=path))
+            return folded(process_request(connection, replace(request, path=path)))
 
         async def filtered(connection: Any) -> None:
             receive = connection.recv
@@ -108,6 +109,24 @@ def guarded_server(host: str, port: int | None = None) -> Iterator[tuple[Any, st
         yield server, f"http://{shown}:{server.get_port()}/{token}"
     finally:
         server.stop()
+
+
+_FOLD = b"""<script>if(matchMedia('(max-width: 36em)').matches)new MutationObserver((_, seen)=>{
+const bar=document.querySelector('div[style*="cursor: pointer"][style*="height: 3.5em"]');
+if(bar){seen.disconnect();bar.click()}}).observe(document,{childList:true,subtree:true})</script></head>"""
+
+
+def folded(response: Any) -> Any:
+    """Return viser's page with a script that folds the panel of a phone at first; other responses as they are."""
+    if response is None or not response.headers.get("Content-Type", "").startswith("text/html"):
+        return response
+    packed = response.headers["Content-Encoding"] == "gzip"
+    page = gzip.decompress(response.body) if packed else response.body
+    page = page.replace(b"</head>", _FOLD, 1)
+    response.body = gzip.compress(page, 1) if packed else page
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = f"{len(response.body)}"
+    return response
 
 
 def is_needed(message: Any, gui: Any) -> bool:

@@ -150,7 +150,7 @@ class Panel:
         self._time_at = self._texts_at = self._plots_at = -np.inf
         self._playing: Any = None
         self._time: Any = None
-        gui.set_panel_label("coopenv")
+        gui.set_panel_label("coopenv controls")
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(0, 114, 178))
         self._head = gui.add_markdown("")
         self._status = gui.add_markdown("", visible=False)

@@ -112,6 +112,9 @@ def test_the_live_view_can_be_worked(
     size: str, view: str, watched: Watched, resembles: Callable[[Any, str], None]
 ) -> None:
     page = watched.opened(view)
+    if size == "phone":
+        page.get_by_role("button", name="Pause").wait_for(state="hidden")
+        page.get_by_text("coopenv controls").click()
     page.get_by_role("button", name="Pause").click()
     page.get_by_role("button", name="Restart").click()
     page.get_by_role("button", name="Pause").wait_for()

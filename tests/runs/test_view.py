@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import socket
 import urllib.error
 import urllib.request
@@ -205,6 +206,15 @@ def status_of(url: str, host: str) -> int:
 def address() -> Iterator[str]:
     with guarded_server("127.0.0.1") as (_, url):
         yield url
+
+
+@pytest.mark.parametrize("encoding", ["gzip", "identity"])
+def test_the_page_folds_the_panel_of_a_phone(encoding: str, address: str) -> None:
+    with urllib.request.urlopen(urllib.request.Request(address, headers={"Accept-Encoding": encoding})) as answer:
+        assert answer.headers["Content-Encoding"] == encoding
+        page = answer.read()
+    page = gzip.decompress(page) if encoding == "gzip" else page
+    assert page.count(b"(max-width: 36em)") >= 1 and page.count(b"bar.click()") == 1
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:1", "null", "https://127.0.0.1"])
