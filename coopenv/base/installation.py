@@ -41,6 +41,11 @@ def data_directory(kind: str) -> Path:
     return shipped if shipped.is_dir() else package.parent / kind
 
 
+def is_installed(path: Path) -> bool:
+    """Return whether a path lies in the package, as the data of a wheel do; those of a checkout lie beside it."""
+    return path.resolve().is_relative_to(Path(__file__).resolve().parents[1])
+
+
 def sample_bags(folder: str | Path = "bags") -> Path:
     """Copy the sample bags to a folder, which is made if need be, and return its path.
 

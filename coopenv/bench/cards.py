@@ -22,7 +22,7 @@ from coopenv.base.columns import WIDTH, Columns, Tabular, one_line, picture_html
 from coopenv.base.errors import ActionError, CoopenvError, check_one_of, checked_seed
 from coopenv.base.files import check_file, replace_text
 from coopenv.base.format import NONE, json_text
-from coopenv.base.installation import load_reference, version
+from coopenv.base.installation import is_installed, load_reference, version
 from coopenv.base.terminal import text_of
 from coopenv.evaluation import METRICS, Difference, Episodes, Result, compare_paired, drive, held_out_seeds, score
 from coopenv.policies import Agent, Policy, agents_for, find_agent
@@ -396,13 +396,16 @@ def carded(contest: Contest) -> list[tuple[Entrant, Path]]:
     """Return the drivers that get a card, with their folders, each of which has a readable card or none.
 
     Raises:
-        CoopenvError: an agent has no folder, or its card cannot be read or written.
+        CoopenvError: an agent has no folder or one of the installed wheel, or its card cannot be read or written.
     """
     found = []
     for entrant in contest.entrants:
         folder = entrant.agent.folder
         if folder is None:
             raise CoopenvError(f"--write-card: {entrant.name} is a place in code; a card needs an agent's folder")
+        if is_installed(folder):
+            why = f"{entrant.name} belongs to the installation; copy {folder} and name the copy in --agents"
+            raise CoopenvError(f"--write-card: {why}")
         if entrant.name != IDEAL:
             read(folder)
             for name in CARD_FILES:

@@ -71,11 +71,15 @@
       path([corner(.02, -.4), corner(.2, -.36), corner(.2, .36), corner(.02, .4)]);
       pen.fillStyle = "#1B2026";
       pen.fill();
-      pen.font = "600 13px system-ui, sans-serif";
+      pen.font = "600 14px system-ui, sans-serif";
       pen.fillStyle = "#fff";
       pen.textAlign = "center";
       const words = `f${i + 1}${i === camera ? ", no camera" : ""}`, half = pen.measureText(words).width / 2 + 4;
-      pen.fillText(words, Math.min(Math.max(x(u), half), width - half), Math.max(y(v) - 16, 14));
+      const place = [words, Math.min(Math.max(x(u), half), width - half), Math.max(y(v) - 16, 14)];
+      pen.lineWidth = 3;
+      pen.strokeStyle = "#1B2026";
+      pen.strokeText(...place);
+      pen.fillText(...place);
     };
     pen.lineWidth = 1;
     const targets = data.landmarks.length;

@@ -116,6 +116,14 @@ def test_cards(capsys: pytest.CaptureFixture[str]) -> None:
     assert "| urban_crossing | 3 |" in text and f"{entry['command']} --write-card" in text
 
 
+def test_a_card_of_the_installation_is_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(data_directory("agents") / "route_follower", "mine", ignore=shutil.ignore_patterns("card.*"))
+    monkeypatch.setattr("coopenv.base.installation.__file__", str(Path("base/installation.py").resolve()))
+    message = refused("evaluate", *SHORT, "--agents", "mine", "--write-card")
+    assert "mine belongs to the installation; copy mine and name the copy in --agents" in message
+    assert not Path("mine/card.json").exists()
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
