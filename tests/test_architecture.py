@@ -93,20 +93,20 @@ def test_a_class_name_means_one_class() -> None:
 LINES_AND_FILES = {
     ".": (129, 2),
     "api": (4402, 19),
-    "backends": (3825, 15),
+    "backends": (3814, 15),
     "base": (1924, 10),
     "bench": (5427, 18),
-    "cars": (10964, 41),
-    "cli": (2679, 9),
+    "cars": (10965, 41),
+    "cli": (2675, 9),
     "estimation": (1898, 7),
-    "evaluation": (495, 3),
+    "evaluation": (492, 3),
     "observers": (11725, 42),
     "policies": (2078, 10),
     "runs": (3555, 13),
-    "scenario": (3750, 12),
+    "scenario": (3749, 12),
     "training": (1612, 6),
     "viz": (4887, 16),
-    "world": (5603, 18),
+    "world": (5601, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 MOST_FILES = 241
