@@ -1,8 +1,8 @@
 """Record the sample bags of this folder from fake cars on a simulated clock: python examples/bags/make.py.
 
-Two cars drive past four landmarks for 12 s. As in a laboratory, messages of svea7 get lost, 1 % of its camera's stamps
-are 3 s ahead, and the clock of svea1 is 0.12 s ahead and drifts. The same bag is written as ROS 2 MCAP, ROS 2 sqlite3
-and ROS 1.
+Two cars drive past four landmarks for 12 s. The commands to their wheels are in the bag. As in a laboratory, messages
+of svea7 get lost, 1 % of its camera's stamps are 3 s ahead, and the clock of svea1 is 0.12 s ahead and drifts. The same
+bag is written as ROS 2 MCAP, ROS 2 sqlite3 and ROS 1.
 """
 
 import math
@@ -25,9 +25,11 @@ from coopenv.cars.profile import MotionCommand, Role
 from coopenv.cars.transport import Arrival, matcher
 
 FLEET = Path(__file__).parents[1] / "fleet" / "overtaking.toml"
-KEPT = (Role.DETECTIONS, Role.CAMERA_INFO, Role.WHEEL, Role.IMU, Role.TRUTH)
-FAULTS = {"svea7": ("loss=0.03", "wrong_stamps=0.01"), "svea1": ("clock_offset=0.12", "clock_drift=0.0002")}
+KEPT = (Role.DETECTIONS, Role.CAMERA_INFO, Role.WHEEL, Role.IMU, Role.TRUTH, Role.MANUAL)
+AHEAD, DRIFT = 0.12, 0.0002  # s, and s per s, of the clock of svea1
+FAULTS = {"svea7": ("loss=0.03", "wrong_stamps=0.01"), "svea1": (f"clock_offset={AHEAD}", f"clock_drift={DRIFT}")}
 SPEEDS = {"svea7": 0.27, "svea1": 0.25}  # m/s
+SLOW = 0.4  # share of the speed from 5 to 7 s and from 10 s on
 SECONDS, STEP = 12.0, 0.001
 BEGIN = 1_760_000_000 * 10**9  # ns
 DELAY = 0.002  # s, mean of the time on the network
@@ -67,9 +69,11 @@ def drive():
     profile = fleet.profile
     for k in range(round(SECONDS / STEP)):
         if k % 50 == 0:
-            turn = 0.35 * math.cos(2.0 * math.pi * k * STEP / 4.0)
+            t = k * STEP
+            turn, share = 0.35 * math.cos(2.0 * math.pi * t / 4.0), SLOW if 5.0 < t < 7.0 or t > 10.0 else 1.0
             for name, speed in SPEEDS.items():
-                command = write_drive(network.now, profile.command, MotionCommand(turn, speed))
+                stamp = network.now + round(1e9 * (AHEAD + DRIFT * t) * (name == "svea1"))  # by the clock of its car
+                command = write_drive(stamp, profile.command, MotionCommand(turn, share * speed))
                 network.publish(profile.topic_of(name, Role.MANUAL), command)
         network.now += round(STEP * 1e9)
         for car in cars.values():
