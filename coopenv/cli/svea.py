@@ -169,6 +169,10 @@ def health(
     connect: options.GateConnect = None,
     off_board: options.OffBoard = False,
     patience: Annotated[float, typer.Option(min=0.1, help="Longest wait for it, s.")] = 2.0,
+    clocks: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="s of messages for offset and drift of its clocks (default: 5 with --off-board)."),
+    ] = None,
 ) -> None:
     """Print the next status of a car's gate, and try from outside a neutral command to the wheels.
 
@@ -201,6 +205,11 @@ def health(
             print(
                 f"{car}: {cause}: from {v:.3g} m/s to a stand {after:.2g} s and {way:.2g} m, with safety.deceleration"
             )
+        if seconds := (5.0 if off_board else 0.0) if clocks is None else clocks:
+            from coopenv.cars.backend.assembler import measured_clocks
+
+            for name, clock in measured_clocks(transport, fleet, car, seconds).items():
+                print(f"{car}: clock of {name}: {clock}")
         if fleet.network.kind != "zenoh":
             print(f"{car}: network.kind = {fleet.network.kind} {UNTRIED}")
             return

@@ -7,9 +7,12 @@ the last frame was, and nothing is in view. Estimates and truth of a tick hold f
 tick's `bearing_age`.
 """
 
+import time
 from collections import Counter, deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import replace
+from itertools import islice, takewhile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +20,12 @@ from numpy.typing import NDArray
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding, NeighbourInbox
 from coopenv.cars.backend.buffers import FrameQueue, Odometer, PoseTrack
+from coopenv.cars.bags.clocks import NEAR, OUTLYING, Delay, checked, jumps, outlying
 from coopenv.cars.codec import decode, stamp_of
-from coopenv.cars.deployment import Sensors
+from coopenv.cars.deployment import Deployment, Sensors
 from coopenv.cars.profile import VELOCITY, Role
 from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, read
-from coopenv.cars.transport import Arrival
+from coopenv.cars.transport import Arrival, Transport
 from coopenv.cars.vision import Calibration
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Message, sealed
@@ -192,29 +196,80 @@ class Assembler:
                 bearings[target], visible[target] = self._to_body[i] @ ray, True
 
 
-WINDOW = 2_000_000_000  # ns over which delays are looked at; a tenth of their stamps may be wrong
-
 BROADCAST = (Role.ESTIMATE, Role.POINT, Role.REPORT)
 """Messages between cars."""
 
 
-@dataclass
-class ClockOffset:
-    """Low quantile of the delays of a topic's messages between stamp and reception; times in ns."""
+WINDOW = 2_000_000_000  # ns that the present offset is of; a tenth of their stamps may be wrong
+KEPT = 3_000  # messages of a topic, half a minute of 100 Hz, that the drift is of
 
-    _delays: deque[tuple[int, int]] = field(default_factory=deque)  # time of reception, delay
 
-    def put(self, stamp: int, received: int) -> None:
-        """Take a message."""
-        self._delays.append((received, received - stamp))
-        while self._delays[0][0] < received - WINDOW:
-            self._delays.popleft()
+class TopicClock:
+    """The clock of a topic's stamps, by its last messages; estimated as that of a topic in a bag. Times in ns."""
+
+    def __init__(self) -> None:
+        """Begin without messages."""
+        self._times: deque[tuple[int, int]] = deque(maxlen=KEPT)  # of reception, and stamp
+        self._usual: int | None = None  # delay of the last message that was not dropped
+        self.dropped = 0
+        """Messages with outlying stamps."""
+
+    def put(self, stamp: int, received: int) -> bool:
+        """Take a message; return whether its stamp fits those before. A jump of the clock fits after some messages."""
+        self._times.append((received, stamp))
+        if self._usual is not None and abs(received - stamp - self._usual) > OUTLYING:
+            times = np.array([*islice(self._recent(), NEAR)][::-1], dtype=np.int64)
+            if outlying(times[:, 1], times[:, 0])[-1]:
+                self.dropped += 1
+                return False
+        self._usual = received - stamp
+        return True
+
+    def _recent(self) -> Iterator[tuple[int, int]]:
+        """Return the messages of the window, the last one first."""
+        newest = self._times[-1][0] if self._times else 0
+        return takewhile(lambda times: times[0] >= newest - WINDOW, reversed(self._times))
 
     @property
     def seconds(self) -> float:
         """Offset of the topic's clock behind the receiver's, transport included, s; NaN: no message yet."""
-        delays = sorted(delay for _, delay in self._delays)
-        return delays[len(delays) // 10] * 1e-9 if delays else float("nan")
+        delays = sorted(received - stamp for received, stamp in self._recent())
+        return delays[len(delays) // 10] * NS if delays else float("nan")
+
+    def line(self) -> Delay | None:
+        """Return the delay at the last message and its drift since the last jump of the clock; None: no message yet."""
+        received, stamps = np.array(self._times, dtype=np.int64).reshape(-1, 2).T
+        found = jumps(stamps, received)
+        first = max(found, default=0)
+        _, delay = checked(stamps[first:], received[first:])
+        if delay is None:
+            return None
+        last = int(received[-1])
+        return replace(delay, offset=delay.at(last), middle=last, jump=found.get(first, delay.jump))
+
+    def __str__(self) -> str:
+        """Return offset, drift, jump and dropped messages in words."""
+        if (delay := self.line()) is None:
+            return "no message with a stamp"
+        parts = [f"{abs(delay.offset) * 1e-6:.1f} ms {'ahead' if delay.offset < 0 else 'behind'}"]
+        parts += [f"drifts by {1e6 * delay.drift:+.0f} us per s"] if delay.drift else []
+        parts += [f"jumped by {-delay.jump * NS:+.3f} s"] if delay.jump else []
+        return ", ".join([*parts, f"{self.dropped} of {len(self._times)} stamps dropped"])
+
+
+def measured_clocks(transport: Transport, fleet: Deployment, car: str, seconds: float) -> dict[str, TopicClock]:
+    """Return the clocks of the topics that a fleet's station reads of a car, by the messages of some time, s."""
+    profile, sensors, arrivals = fleet.profile, fleet.sensors, list[Arrival]()
+    roles = [*VELOCITY[sensors.odometry], Role(sensors.detections), *([Role.TRUTH] if sensors.truth else [])]
+    types = {profile.topic_of(car, role): profile.topics[role].type for role in roles}
+    for topic in types:
+        transport.subscribe(topic, arrivals.append)
+    time.sleep(seconds)
+    clocks = {topic: TopicClock() for topic in types}
+    for arrival in sorted(arrivals[:], key=lambda arrival: arrival.received):
+        with suppress(CoopenvError):
+            clocks[arrival.topic].put(stamp_of(decode(arrival.payload, types[arrival.topic])), arrival.received)
+    return clocks
 
 
 class Intake:
@@ -237,7 +292,7 @@ class Intake:
             for role in some
         }
         """Car, role and camera of the topics that are read, by name."""
-        self.offsets = {topic: ClockOffset() for topic, (name, _, _) in self.topics.items() if name in binding.cars}
+        self.clocks = {topic: TopicClock() for topic, (name, _, _) in self.topics.items() if name in binding.cars}
 
     def samples(self, arrival: Arrival) -> Iterator[Sample]:
         """Yield the sample of a message, or none if the message is malformed."""
@@ -256,14 +311,15 @@ class Intake:
         if isinstance(value, Twist) and role is Role.WHEEL and self._sensors.odometry == "wheel+imu":
             value = Twist(value.linear, None)  # the IMU's turn rate alone counts
         stamp += value.late if isinstance(value, Detections) else 0
-        if arrival.topic in self.offsets:
-            self.offsets[arrival.topic].put(stamp, arrival.received)
+        if arrival.topic in self.clocks and not self.clocks[arrival.topic].put(stamp, arrival.received):
+            self.rejected[car]["outlying stamp"] += 1
+            return
         yield Sample(car, role, stamp, arrival.received, value)
 
     def offset_of(self, car: str) -> float:
         """Return the least offset of the topics of a car, without motion capture, s; NaN: no message yet."""
         own = (topic for topic, (name, role, _) in self.topics.items() if name == car and role is not Role.TRUTH)
-        return min((found for topic in own if (found := self.offsets[topic].seconds) == found), default=float("nan"))
+        return min((found for topic in own if (found := self.clocks[topic].seconds) == found), default=float("nan"))
 
     def unsynchronised(self, car: str, most: float) -> Iterator[str]:
         """Yield the clocks of a car and of its topics that are off by more than `most`, s.
@@ -274,7 +330,7 @@ class Intake:
         for topic, (name, role, _) in self.topics.items():
             if name == car:
                 age = self._profile.topics[role].max_age if KINDS.get(role) == "frame" else None
-                found.append((f"stamps of {topic} are", self.offsets[topic].seconds, most + (age or 0.0)))
+                found.append((f"stamps of {topic} are", self.clocks[topic].seconds, most + (age or 0.0)))
         for what, offset, behind in found:
             if not -most <= offset <= behind and offset == offset:
                 side, allowed = ("behind", behind) if offset > 0.0 else ("ahead of", most)

@@ -44,6 +44,10 @@ class Delay:
     middle: int
     jump: int = 0  # largest change of its level that is no drift; 0: none
 
+    def at(self, received: int) -> int:
+        """Return the delay at a time of reception, ns."""
+        return self.offset + round(self.drift * (received - self.middle))
+
 
 def outlying(stamps: Times, received: Times) -> NDArray[np.bool_]:
     """Return flags of wrong stamps (n,): ahead of their neighbours, or behind them and out of order."""

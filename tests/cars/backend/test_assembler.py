@@ -11,7 +11,7 @@ import pytest
 
 from coopenv.backends.base import VehicleBroadcast
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend.assembler import Assembler, Intake
+from coopenv.cars.backend.assembler import Assembler, Intake, TopicClock
 from coopenv.cars.backend.binding import Binding, bind, estimate_message, report_message
 from coopenv.cars.backend.buffers import LONGEST_GAP, PoseTrack
 from coopenv.cars.codec import decode, encode, header, make
@@ -426,3 +426,50 @@ def test_the_clock_of_each_topic_is_checked_against_a_few_wrong_stamps() -> None
     assert not list(intake.unsynchronised("car0", 0.02))  # the camera may take its time besides
     send(Role.DETECTIONS, -100)
     assert list(intake.unsynchronised("car0", 0.02))[1].startswith(f"stamps of {camera} are 100 ms ahead of this")
+
+
+@pytest.mark.parametrize("drift", [50e-6, -500e-6])
+def test_a_live_clock_has_offset_and_drift_and_outlying_stamps_are_dropped(drift: float) -> None:
+    """Stamps of 50 s at 60 Hz, 1 % of them 3 s ahead, with a mean delay of 2 ms besides the clock's."""
+    rng, clock, S = np.random.default_rng(3), TopicClock(), 1000 * MS
+    true = START + (np.arange(3000) * S) // 60
+    received = true + (rng.exponential(0.002, len(true)) * S).astype(np.int64)
+    wrong = (rng.random(len(true)) < 0.01) & (np.arange(len(true)) > 0)
+    stamps = true - 300 * MS - np.round(drift * (true - START)).astype(np.int64) + 3 * S * wrong
+    kept = [clock.put(int(s), int(r)) for s, r in zip(stamps, received, strict=True)]
+    np.testing.assert_array_equal(kept, ~wrong)
+    line = clock.line()
+    assert line is not None and clock.dropped == wrong.sum() > 20
+    assert line.drift == pytest.approx(drift, abs=1e-5) and not line.jump
+    assert line.offset / S == pytest.approx(0.3 + 50.0 * drift, abs=1e-3)
+    assert clock.seconds == pytest.approx(0.3 + 50.0 * drift, abs=2e-3)
+    assert str(clock).endswith(
+        f" behind, drifts by {1e6 * line.drift:+.0f} us per s, {wrong.sum()} of 3000 stamps dropped"
+    )
+
+
+@pytest.mark.parametrize("jump", [0.4, -0.4])
+def test_a_live_clock_that_jumps_is_followed(jump: float) -> None:
+    rng, clock, S = np.random.default_rng(4), TopicClock(), 1000 * MS
+    true = START + (np.arange(1200) * S) // 60
+    stamps = true + round(jump * S) * (np.arange(1200) >= 600) - np.round(1e-4 * (true - START)).astype(np.int64)
+    kept = [
+        clock.put(int(s), int(s_) + int(d * S))
+        for s, s_, d in zip(stamps, true, rng.exponential(0.001, 1200), strict=True)
+    ]
+    assert all(kept[:600]) and all(kept[650:]) and clock.dropped < 50
+    line = clock.line()
+    assert line is not None and line.jump / S == pytest.approx(-jump, abs=0.01)
+    assert line.drift == pytest.approx(1e-4, abs=2e-5) and line.offset / S == pytest.approx(20e-4 - jump, abs=2e-3)
+    assert f"jumped by {jump:+.1f}" in str(clock)
+
+
+def test_outlying_stamps_of_a_topic_give_no_samples() -> None:
+    """Of a car whose clock is behind by 3 s, so that a stamp of now would keep later ones from counting."""
+    intake, topic = Intake(binding(), Sensors(odometry="wheel+imu")), SVEA.topic_of("car0", Role.DETECTIONS)
+    found = 0
+    for k in range(60):
+        stamp = START + k * 20 * MS - (0 if k == 40 else 3_000 * MS)
+        payload = encode(make(SVEA.topics[Role.DETECTIONS].type, header=header(stamp), objects=[]))
+        found += len(list(intake.samples(Arrival(topic, payload, START + k * 20 * MS))))
+    assert found == 59 and intake.rejected["car0"] == {"outlying stamp": 1}

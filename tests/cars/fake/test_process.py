@@ -117,7 +117,12 @@ def test_cars_come_and_go() -> None:
             seen = seen_by(here)
             wait_until(lambda: set(seen) == {(presence_of("svea7"), True), (presence_of("svea1"), True)})
             assert len(mentioning(endpoint)) == 3
-            lines = health(SHIPPED, endpoint).output.splitlines()
+            lines = health(SHIPPED, endpoint, "--clocks", "1").output.splitlines()
+            clocks = [line for line in lines if "clock of" in line]
+            lines = [line for line in lines if line not in clocks]
+            found = [re.match(r"svea7: clock of fleet/(.*): (.*) ms (behind|ahead), .*0 of", line) for line in clocks]
+            assert [m and m[1].split("/")[-1] for m in found] == ["velocity", "data_raw", "objects_info", "odom"]
+            assert all(m and float(m[2]) < 50.0 for m in found)
             assert lines[0] == "svea7: gate disarmed, 0 commands accepted, 0 messages refused"
             stands = "from 0.5 m/s to a stand 0.8 s and 0.28 m, with safety.deceleration"
             assert lines[1] == f"svea7: station or radio silent: {stands}"
