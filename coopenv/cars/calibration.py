@@ -309,7 +309,7 @@ def toml_text(result: Calibrated) -> str:
             found: Constants = {"wheel_scale": float(own[SCALE]), "gyro_bias": float(own[BIAS])}
             found |= {} if car.lens is None else intrinsics(batch, c, value)
             tables[f"corrections.{car.name}"] = {name: np.round(v, 7).tolist() for name, v in found.items()}
-    first = "Written by coopenv calibrate, for the key `calibration` of a bag's map."
+    first = "Written by coopenv calibrate, for the key `calibration` of a bag's map or a deployment file."
     return tables_text(first, {"overrides": overrides(result), "clocks.leads": leads, **tables}, result.rows)
 
 

@@ -14,6 +14,7 @@ from coopenv.cars.fake.settings import USUAL as DEFAULT_FAKE
 from coopenv.cars.fake.settings import FakeSettings
 from coopenv.cars.gate import TIMEOUT
 from coopenv.cars.profile import (
+    MOST_CHANNELS,
     SVEA,
     USUAL,
     CarProfile,
@@ -26,6 +27,7 @@ from coopenv.cars.profile import (
     is_simple,
     load_profile,
 )
+from coopenv.cars.sensor_settings import Name, Sensors, read_calibration
 from coopenv.cars.transport import SECURE, UNIX, Tls, address_of
 
 Endpoint = Annotated[str, AfterValidator(lambda text: address_of(text) and text)]  # such as tcp/127.0.0.1:7447
@@ -80,8 +82,6 @@ class GateLink(Section):
     the loopback, at its usual port). With `docker/car-zenoh.json5`: `unixsock-stream//run/coopenv/zenoh.sock`."""
 
 
-MOST_CHANNELS = 18
-
 Channel = Annotated[int, Field(ge=1, le=MOST_CHANNELS)]
 
 
@@ -125,7 +125,6 @@ class Remote(Section):
         return abs(pulses[self.mode_switch - 1] - before[self.mode_switch - 1]) > usual.moved
 
 
-Name = Annotated[str, Field(max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 Marker = Annotated[int, Field(ge=0)]
 Agent = Annotated[int, Field(ge=0, le=9999)]
 Age = Annotated[float, Field(gt=0.0, le=2.0)]
@@ -182,21 +181,6 @@ def refuse_repeated(cars: Sequence[Car], markers: Mapping[str, int], numbers: tu
     for i, car in enumerate(cars):
         if car.vehicle is not None and car.landmark is not None:
             raise ValueError(f"cars.{i}: is a vehicle or a landmark, not both")
-
-
-class Sensors(Section):
-    """Topics that are read."""
-
-    odometry: Literal["wheel+imu", "wheel", "odometry"] = "wheel+imu"
-    """Source of the body twist: speed of the wheels and turn rate of the IMU, the wheels alone, or the car's own
-    filter."""
-    detections: Literal["detections", "bearings"] = "detections"
-    """`detections`: pixels, from which distortion is removed on this computer; `bearings`: unit vectors of the authors'
-    node."""
-    distorted: bool = True
-    """Treat `bearings` as computed from distorted pixels, as the authors' are."""
-    truth: bool = True
-    """Read motion capture. It serves infos, metrics and safety, never observations."""
 
 
 LIMITED = ("speed", "steering", "acceleration", "steering_rate")
@@ -315,6 +299,9 @@ class Deployment(Section):
     identified: str | None = Field(default=None, exclude=True)
     """File that `coopenv identify` has written (relative to this file): its overrides and its table `fake` replace
     those of this file."""
+    calibration: str | None = Field(default=None, exclude=True)
+    """File that `coopenv calibrate` has written (relative to this file): its overrides replace those of this file, its
+    corrections and leads of clocks those in `sensors`."""
     file: Path = Field(default=Path(), exclude=True)
     """Path of the deployment; set by `load_deployment`."""
 
@@ -329,6 +316,14 @@ class Deployment(Section):
         if self.safety.reverse and not self.profile.hardest.reverse:
             raise ValueError("safety.reverse: true, but this make does not reverse")
         refuse_foreign(self.network.kind, self.gate_connect, "gate.connect")
+        driven = [car.name for car in self.cars if car.landmark is None]
+        topics = ["/" + self.profile.topic_of(car, role) for car in driven for role in self.sensors.roles]
+        for what, given, known in (
+            ("corrections", self.sensors.corrections, driven),
+            ("leads", self.sensors.leads, topics),
+        ):
+            for name in given:
+                check_one_of(f"sensors.{what}: unknown", name, known, ValueError)
         if self.profile.sees_frames and (self.sensors.detections, self.sensors.distorted) != ("bearings", False):
             raise ValueError(
                 "sensors: frames are not sent to the station: `coopenv svea see` makes bearings of them on the car, "
@@ -403,6 +398,13 @@ def load_deployment(path: str | Path, connect: str | None = None) -> Deployment:
         found = read_toml(path.parent / name, DeploymentError)
         validated(IdentifiedFile, json.dumps(found, default=str), f"{path.name}: identified: {name}", DeploymentError)
         raw = with_tables(raw, found, ("overrides", "fake"), f"{path.name} and {name}", DeploymentError)
+    if isinstance(name := raw.get("calibration"), str):
+        both = f"{path.name} and {name}"
+        found = read_calibration(path.parent / name, f"{path.name}: calibration: {name}", DeploymentError)
+        raw = with_tables(raw, found, ("overrides",), both, DeploymentError)
+        more = {"corrections": found.get("corrections", {}), "leads": found["clocks"]["leads"]}
+        own = with_tables(raw, {}, ("sensors",), path.name, DeploymentError)["sensors"]
+        raw["sensors"] = with_tables(own, more, tuple(more), f"{both}: sensors", DeploymentError)
     return parse_deployment(raw, path)
 
 

@@ -299,6 +299,10 @@ class CommandMessage(Section):
         return MotionCommand(steering, speed)
 
 
+MOST_CHANNELS = 18
+"""Of a remote control."""
+
+
 class RemotePulses(Section):
     """Pulses of the remote control, us."""
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.cars.codec import numbers_after_header
-from coopenv.cars.deployment import MOST_CHANNELS
-from coopenv.cars.profile import GATE_TYPES, CarProfile, MotionCommand, Role, VisionSettings
+from coopenv.cars.profile import GATE_TYPES, MOST_CHANNELS, CarProfile, MotionCommand, Role, VisionSettings
 from coopenv.cars.vision import BEARINGS, FINDERS, UNIT, Calibration, Tag
 from coopenv.estimation.poses import Array, log_so3
 from coopenv.observers.contract import Message

@@ -22,9 +22,10 @@ from coopenv.cars.backend.binding import Binding, NeighbourInbox
 from coopenv.cars.backend.buffers import FrameQueue, Odometer, PoseTrack
 from coopenv.cars.bags.clocks import NEAR, OUTLYING, Delay, checked, jumps, outlying
 from coopenv.cars.codec import decode, stamp_of
-from coopenv.cars.deployment import Deployment, Sensors
-from coopenv.cars.profile import VELOCITY, Role
+from coopenv.cars.deployment import Deployment
+from coopenv.cars.profile import Role
 from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.sensor_settings import Correction, Sensors
 from coopenv.cars.transport import Arrival, Transport
 from coopenv.cars.vision import Calibration
 from coopenv.estimation.poses import Array
@@ -259,16 +260,17 @@ class TopicClock:
 
 def measured_clocks(transport: Transport, fleet: Deployment, car: str, seconds: float) -> dict[str, TopicClock]:
     """Return the clocks of the topics that a fleet's station reads of a car, by the messages of some time, s."""
-    profile, sensors, arrivals = fleet.profile, fleet.sensors, list[Arrival]()
-    roles = [*VELOCITY[sensors.odometry], Role(sensors.detections), *([Role.TRUTH] if sensors.truth else [])]
-    types = {profile.topic_of(car, role): profile.topics[role].type for role in roles}
+    profile, leads, arrivals = fleet.profile, fleet.sensors.leads, list[Arrival]()
+    types = {profile.topic_of(car, role): profile.topics[role].type for role in fleet.sensors.roles}
     for topic in types:
         transport.subscribe(topic, arrivals.append)
     time.sleep(seconds)
     clocks = {topic: TopicClock() for topic in types}
     for arrival in sorted(arrivals[:], key=lambda arrival: arrival.received):
+        topic = arrival.topic
         with suppress(CoopenvError):
-            clocks[arrival.topic].put(stamp_of(decode(arrival.payload, types[arrival.topic])), arrival.received)
+            stamp = stamp_of(decode(arrival.payload, types[topic])) + round(leads.get(f"/{topic}", 0.0) / NS)
+            clocks[topic].put(stamp, arrival.received)
     return clocks
 
 
@@ -280,11 +282,15 @@ class Intake:
         self._sensors, self._profile = sensors, binding.profile
         self.rejected: dict[str, Counter[str]] = {name: Counter() for name in (*binding.cars, *binding.leaders)}
         """Messages that could not be used, by car and role."""
-        self.calibrations = {name: Calibration.of(binding.scenario.cameras[i]) for name, i in binding.cars.items()}
-        """Calibrations of the environment, by car."""
+        right, cameras = sensors.corrections, binding.scenario.cameras
+        self.calibrations = {
+            name: right.get(name, Correction()).lens(Calibration.of(cameras[i])) for name, i in binding.cars.items()
+        }
+        """Of the environment, corrected, by car."""
         truth: tuple[Role, ...] = (Role.TRUTH,) if sensors.truth else ()
-        own = (*VELOCITY[sensors.odometry], Role(sensors.detections), *truth)
-        roles = {name: own if i in binding.local else (*truth, *BROADCAST) for name, i in binding.cars.items()}
+        roles = {
+            name: sensors.roles if i in binding.local else (*truth, *BROADCAST) for name, i in binding.cars.items()
+        }
         roles |= dict.fromkeys(binding.leaders, (Role.ESTIMATE, Role.POINT, *truth))
         self.topics = {
             binding.profile.topic_of(name, role): (name, role, self.calibrations.get(name))
@@ -308,9 +314,12 @@ class Intake:
         except CoopenvError:
             self.rejected[car][role.value] += 1
             return
-        if isinstance(value, Twist) and role is Role.WHEEL and self._sensors.odometry == "wheel+imu":
-            value = Twist(value.linear, None)  # the IMU's turn rate alone counts
+        if isinstance(value, Twist):
+            value = self._sensors.corrections.get(car, Correction()).twist(value)
+            if role is Role.WHEEL and self._sensors.odometry == "wheel+imu":
+                value = Twist(value.linear, None)  # the IMU's turn rate alone counts
         stamp += value.late if isinstance(value, Detections) else 0
+        stamp += round(self._sensors.leads.get(f"/{arrival.topic}", 0.0) / NS)
         if arrival.topic in self.clocks and not self.clocks[arrival.topic].put(stamp, arrival.received):
             self.rejected[car]["outlying stamp"] += 1
             return

@@ -187,7 +187,8 @@ class Svea:
             camera = profile.topic_of(car, Role(self.deployment.sensors.detections))
             if (age := self.station.silence(camera)) > safety.odometry_age:
                 yield car, f"no camera frames on {camera} {since(age)}"
-            own = self.board.obstacles(car, safety.min_battery, self.intake.calibrations[car])
+            right = self.deployment.sensors.corrections.get(car)
+            own = self.board.obstacles(car, safety.min_battery, self.intake.calibrations[car], right)
             yield from ((car, why) for why in own)
         if safety.judge == "truth":  # estimates are not known before cars drive
             yield from self.watchdog.misplaced()

@@ -19,6 +19,7 @@ from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Remote
 from coopenv.cars.profile import SVEA, CarProfile, Role
 from coopenv.cars.readings import CarStatus, Detections, Twist, read
+from coopenv.cars.sensor_settings import Correction
 from coopenv.cars.transport import Arrival, Transport
 from coopenv.cars.vision import Calibration
 from coopenv.estimation.poses import Array, exp_so3, exp_translation, log_so3
@@ -220,13 +221,14 @@ class StatusBoard:
         with self._lock:
             self._begun, self._happened = dict(self._conditions), {}
 
-    def obstacles(self, car: str, least: float, used: Calibration) -> Iterator[str]:
+    def obstacles(self, car: str, least: float, used: Calibration, right: Correction | None = None) -> Iterator[str]:
         """Yield reasons not to arm a car by its conditions.
 
         Args:
             car: its name.
             least: share of its battery that it needs.
             used: calibration of its camera, which its own has to agree with.
+            right: constants that take the place of its own (None: none do).
         """
         remote, state = self._conditions[car, Role.REMOTE].status, self._conditions[car, Role.STATE].status
         battery = self._conditions[car, Role.BATTERY].status.battery
@@ -240,6 +242,8 @@ class StatusBoard:
         if battery is not None and battery < least:
             yield f"its battery is at {100 * battery:.0f} %, {100 * least:.0f} % are needed"
         published = self.calibrations.get(car)
+        if published is not None and right is not None:
+            published = right.lens(published)
         for name, tolerance in TOLERANCES.items() if published is not None else ():
             a, b = getattr(published, name), getattr(used, name)
             if len(a) != len(b) or (np.abs(np.subtract(a, b)) > tolerance).any():

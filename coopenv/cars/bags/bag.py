@@ -21,9 +21,10 @@ from coopenv.cars.backend.binding import OPTIONS, bind, marker_places, reset_opt
 from coopenv.cars.bags.clocks import checked
 from coopenv.cars.bags.files import BagFile, check_extra
 from coopenv.cars.bags.log import NS, TopicRow, read_log, regularity
-from coopenv.cars.bags.topic_map import READ, TOPIC, UNNEEDED, TopicMap, load_map
+from coopenv.cars.bags.topic_map import READ, UNNEEDED, TopicMap, load_map
 from coopenv.cars.profile import IMAGES, SVEA, VELOCITY, Role
 from coopenv.cars.readings import POSES, READERS, CarPose, Sample, read
+from coopenv.cars.sensor_settings import TOPIC
 from coopenv.cars.vision import Calibration
 from coopenv.scenario import Scenario, load_scenario
 

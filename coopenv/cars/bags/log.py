@@ -26,11 +26,12 @@ from coopenv.base.errors import CoopenvError, DataError, DataWarning, listed
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.bags.clocks import Delay, Leads, checked, jumps, leads_of, moves_of
 from coopenv.cars.bags.files import BagFile
-from coopenv.cars.bags.topic_map import TRUTH, Chosen, ClockSettings, Correction, MapFrame, TopicMap, select
+from coopenv.cars.bags.topic_map import TRUTH, Chosen, ClockSettings, MapFrame, TopicMap, select
 from coopenv.cars.codec import encode, stamp_of
 from coopenv.cars.gate import read_drive
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.sensor_settings import Correction
 from coopenv.cars.vision import Calibration
 from coopenv.scenario.sensing import rotation_of
 

@@ -3,16 +3,15 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Literal, Self
 
-import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from coopenv.base.errors import CoopenvError, DataError, check_one_of, listed, suggest
-from coopenv.base.sections import PositiveVector2, Section, Vector2, read_toml, validated, with_tables
-from coopenv.cars.deployment import Car, Marker, Name, refuse_repeated
+from coopenv.base.sections import Section, read_toml, validated, with_tables
+from coopenv.cars.deployment import Car, Marker, refuse_repeated
 from coopenv.cars.profile import (
     AUTHORS,
     PREFIX,
@@ -25,9 +24,8 @@ from coopenv.cars.profile import (
     VisionSettings,
     load_profile,
 )
-from coopenv.cars.readings import READERS, Twist
-from coopenv.cars.vision import Calibration
-from coopenv.estimation.lens import COEFFICIENTS
+from coopenv.cars.readings import READERS
+from coopenv.cars.sensor_settings import Correction, Name, TopicName, read_calibration
 
 PATTERNS: dict[str, dict[Role, tuple[str, ...]]] = {
     "authors": {role: tuple(f"/{name}" for name in names) for role, names in AUTHORS.items()},
@@ -46,10 +44,6 @@ def patterns_of(names: str, make: CarProfile) -> dict[Role, tuple[str, ...]]:
         given = (topic.name, *(topic.bag_names or (topic.name.removeprefix(f"{PREFIX}/"),)))
         found[role] = tuple(dict.fromkeys(f"/{name}" for name in given))
     return found
-
-
-TOPIC = r"^/[A-Za-z0-9_/~]{1,255}$"
-TopicName = Annotated[str, Field(pattern=TOPIC)]
 
 
 class TopicMapError(CoopenvError):
@@ -111,39 +105,6 @@ class BagCar(Car):
         """Placeholders of the car in the names of a scheme."""
         agent = self.name if self.agent_number is None else f"agent{self.agent_number}"
         return {"car": self.name, "agent": agent, "body": self.body or self.name}
-
-
-class Correction(Section):
-    """Constants of a car, as `coopenv calibrate` finds them."""
-
-    focal_length: PositiveVector2 | None = None
-    """Focal length of its camera, instead of CameraInfo's, px."""
-    principal_point: Vector2 | None = None
-    """Principal point of its camera, px."""
-    distortion: tuple[Number, ...] | None = None
-    """Distortion of its camera: 5 or 8 coefficients, or 4 of a fisheye."""
-    wheel_scale: float = Field(default=0.0, gt=-1.0, le=10.0)
-    """Relative error of its speeds, removed."""
-    gyro_bias: Number = 0.0
-    """Error of its turn rates, removed, rad/s."""
-
-    @field_validator("distortion")
-    @classmethod
-    def _is_of_a_model(cls, given: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if given is not None and len(given) not in COEFFICIENTS:
-            raise ValueError(f"has {len(given)} coefficients, a model has 4, 5 or 8")
-        return given
-
-    def lens(self, lens: Calibration) -> Calibration:
-        """Return a camera's intrinsics with those that are given here."""
-        names = ("focal_length", "principal_point", "distortion")
-        return replace(lens, **{name: value for name in names if (value := getattr(self, name)) is not None})
-
-    def twist(self, twist: Twist) -> Twist:
-        """Return a measured twist without its errors."""
-        v, w = twist.linear, twist.angular
-        bias = np.array([0.0, 0.0, self.gyro_bias])
-        return Twist(None if v is None else v / (1.0 + self.wheel_scale), None if w is None else w - bias)
 
 
 class ClockSettings(Section):
@@ -237,21 +198,6 @@ class TopicMap(Section):
         return str(beside) if self.environment.endswith(".toml") else self.environment
 
 
-class CalibratedClocks(Section):
-    """Table `clocks` of a calibration."""
-
-    leads: dict[TopicName, Number] = Field(max_length=64)
-
-
-class CalibrationFile(Section):
-    """Calibration file of `coopenv calibrate`."""
-
-    overrides: dict[str, Any]
-    clocks: CalibratedClocks
-    corrections: dict[Name, Correction] = Field(default={})
-    constants: dict[str, Any]
-
-
 def load_map(path: str | Path) -> TopicMap:
     """Read the map of a bag.
 
@@ -261,9 +207,8 @@ def load_map(path: str | Path) -> TopicMap:
     path = Path(path)
     data = read_toml(path, TopicMapError)
     if isinstance(name := data.get("calibration"), str):
-        found = read_toml(path.parent / name, TopicMapError)
         both = f"{path.name} and {name}"
-        validated(CalibrationFile, json.dumps(found, default=str), f"{path.name}: calibration: {name}", TopicMapError)
+        found = read_calibration(path.parent / name, f"{path.name}: calibration: {name}", TopicMapError)
         own = with_tables(data, {}, ("clocks",), path.name, TopicMapError)["clocks"]
         data = with_tables(data, found, ("overrides", "corrections"), both, TopicMapError)
         data["clocks"] = with_tables(own, found["clocks"], ("leads",), f"{both}: clocks", TopicMapError)

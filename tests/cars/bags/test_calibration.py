@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from coopenv.base.errors import DataError
-from coopenv.cars.bags.topic_map import Correction
 from coopenv.cars.calibration import Calibrated, calibrate, toml_text
 from coopenv.cars.calibration_drives import CalibrationDrive, CarDrive
+from coopenv.cars.sensor_settings import Correction
 from coopenv.cars.vision import Calibration, rays
 from coopenv.cli.app import main
 from coopenv.scenario import load_scenario

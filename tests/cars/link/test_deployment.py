@@ -140,7 +140,7 @@ def test_identified_takes_the_result_of_identify_alone(tmp_path: Path) -> None:
 
 def test_of_another_kind_of_file_all_keys_are_listed() -> None:
     """The nearest key helps after a typing error alone."""
-    with pytest.raises(DeploymentError, match=r"^svea_overtaking\.toml: title: unknown key; allowed: cars, "):
+    with pytest.raises(DeploymentError, match=r"^svea_overtaking\.toml: title: unknown key; allowed: calibration, "):
         load_deployment(Path(__file__).parents[3] / "envs" / "svea_overtaking.toml")
 
 
