@@ -24,6 +24,9 @@ def object_bearings(markers: Iterable[int], rays: Iterable[Iterable[float]]) -> 
     return [make(kind, id=n, bearing_x=-x, bearing_y=-y, bearing_z=-z) for n, x, y, z in rows]
 
 
+MOST_REASONS = 100  # that are counted; errors quote what a message holds
+
+
 class FrameReader:
     """Publishes the bearings of tags in frames, the newest first; frames that come in the meantime are left out."""
 
@@ -61,6 +64,8 @@ class FrameReader:
                 self._note(str(error), str(error))
 
     def _note(self, reason: str, line: str) -> None:
+        if reason not in self.counts and len(self.counts) >= MOST_REASONS:
+            return
         self.counts[reason] += 1
         if self.counts[reason] == 1:
             print(f"{self._car}: {line}", file=sys.stderr, flush=True)

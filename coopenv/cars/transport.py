@@ -71,6 +71,22 @@ class Transport(Protocol):
         ...
 
 
+class ReceivingTransport:
+    """A transport on which nothing is sent: of a program that only watches."""
+
+    def __init__(self, transport: Transport) -> None:
+        """Wrap a transport."""
+        self.subscribe, self.watch, self.close = transport.subscribe, transport.watch, transport.close
+
+    def publish(
+        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
+    ) -> None:
+        """Send nothing."""
+
+    def announce(self, name: str) -> None:
+        """Announce nothing."""
+
+
 def matcher(pattern: str) -> Callable[[str], bool]:
     """Return the test whether a topic matches: `*` stands for one part of it, `**` for any number, none included."""
     wild = {"*": "[^/]+/", "**": "(?:[^/]+/)*"}
@@ -80,6 +96,8 @@ def matcher(pattern: str) -> Callable[[str], bool]:
 
 PERIOD = 0.25  # s between two heartbeats
 LEASE = 1.0  # s of silence after which a name counts as gone
+MOST_PRESENT, LONGEST = 256, 256
+"""Names of other ends that count at a time, and bytes of a name with its sender: any program can send heartbeats."""
 
 
 class HeartbeatTransport(ABC):
@@ -125,11 +143,11 @@ class HeartbeatTransport(ABC):
     def heartbeat(self, name: str, payload: bytes) -> None:
         """Take a heartbeat: `+` or `-` and the sender's bytes."""
         with self._presence:
-            before = self._present()
-            if payload[:1] == b"+":
-                self._last[name, payload[1:]] = time.monotonic()
-            else:
-                self._last.pop((name, payload[1:]), None)
+            before, key = self._present(), (name, payload[1:])
+            if payload[:1] != b"+":
+                self._last.pop(key, None)
+            elif key in self._last or (len(self._last) < MOST_PRESENT and len(name) + len(payload) <= LONGEST):
+                self._last[key] = time.monotonic()
             self._notify(before)
 
     def beat(self) -> None:

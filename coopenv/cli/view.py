@@ -238,7 +238,8 @@ class ViewOptions(SceneOptions):
         from coopenv.cars.backend.backend import open_svea
 
         watching = {} if self.observer is None else {"observer.name": self.observer}
-        return open_svea(self.deployment, None, {**self.changes, **watching, **(more or {})}, connect=self.connect)
+        changes = {**self.changes, **watching, **(more or {})}
+        return open_svea(self.deployment, None, changes, connect=self.connect, watch=True)
 
     def reel(self) -> "Reel":
         """Return the source of frames; cars are observed and not driven.

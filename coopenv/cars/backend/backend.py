@@ -29,7 +29,7 @@ from coopenv.cars.codec import encode, make, warm_up
 from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.keys import Signer, Verifier, load_keys
 from coopenv.cars.profile import RESET_TOPIC, VELOCITY, Role, presence_of
-from coopenv.cars.transport import Transport
+from coopenv.cars.transport import ReceivingTransport, Transport
 from coopenv.cars.zenoh import open_transport
 from coopenv.estimation.poses import left_covariance
 from coopenv.observers.recording import Sensed
@@ -318,6 +318,7 @@ def open_svea(
     record: str | Path | None = None,
     transport: Transport | None = None,
     connect: str | None = None,
+    watch: bool = False,
 ) -> Svea:
     """Return the cars of a deployment file as a backend.
 
@@ -329,6 +330,7 @@ def open_svea(
         record: MCAP file to write what comes and goes to.
         transport: a network that is open already (None: that of the file).
         connect: endpoint in place of the file's.
+        watch: only receive: nothing is sent, fakes are not moved, and no car can be armed.
 
     A `DataWarning` names landmarks and vehicles that cameras cannot identify.
 
@@ -343,6 +345,7 @@ def open_svea(
         warnings.warn(DataWarning(remark), stacklevel=2)
     signer, verifier = load_keys(deployment.keys, car or deployment.security.identity, binding.cars)
     link = open_transport(deployment) if transport is None else transport
+    link = ReceivingTransport(link) if watch else link
     try:
         types = _types(binding, deployment.security.identity)
         recorder = None if record is None else DriveRecorder(Path(record), head_of(deployment, binding, car), types)

@@ -27,6 +27,8 @@ from coopenv.cars.vision import Calibration
 
 LATE = 50_000_000
 """ns: measurements that are overdue for longer than this are left out, as after a computer that stood still."""
+MOST_WAITING, MOST_LINES = 256, 100
+"""Messages that wait for the next turn, the oldest of more are dropped; and errors of messages that are printed."""
 
 
 class Fake:
@@ -63,7 +65,8 @@ class Fake:
         self.world = CarWorld(scenario, agent, frames=self._profile.sees_frames)
         self._origin = np.array(scenario.map.origin)
         self._wire = Wire(transport, self._faults, clock.steady, seed, settings)
-        self._inbox: deque[Callable[[], None]] = deque()
+        self._inbox: deque[Callable[[], None]] = deque(maxlen=MOST_WAITING)
+        self._errors = 0  # of messages
         self._others = Neighbours(self.world, binding, name, transport)
         self._link: GateConnection | None = None
         self._outside = SensorPublisher(name, self._profile, transport)  # motion capture: not the car's own link
@@ -128,7 +131,10 @@ class Fake:
             try:
                 self._inbox.popleft()()
             except CoopenvError as error:
-                print(f"{self.name}: {error}", file=sys.stderr, flush=True)
+                self._errors += 1
+                if self._errors <= MOST_LINES:
+                    last = "; further errors are not printed" if self._errors == MOST_LINES else ""
+                    print(f"{self.name}: {error}{last}", file=sys.stderr, flush=True)
         self._events.run(blocking=False)
         if self._link is not None and self._link.news.is_set():
             self._link.publish_status()

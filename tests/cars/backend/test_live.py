@@ -20,7 +20,7 @@ from coopenv.cars.backend.backend import Svea
 from coopenv.cars.backend.drive import Drive
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.fake.car import Fake
-from coopenv.cars.profile import SVEA, Role
+from coopenv.cars.profile import RESET_TOPIC, SVEA, Role
 from coopenv.cars.transport import Arrival
 from tests.helpers.cars import OVERTAKING, PATIENT, cars, fakes, send_fault, write_fleet
 from tests.helpers.hub import Hub
@@ -363,3 +363,18 @@ def test_an_error_between_steps_stops_the_cars(lab: Any) -> None:
 def test_options_that_are_none(env: Env, options: dict[str, Any]) -> None:
     with pytest.raises(CoopenvError, match="option"):
         env.reset(seed=0, options=options)
+
+
+@pytest.mark.parametrize("watch", [True, False])
+def test_a_station_that_only_watches_sends_nothing(
+    watch: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("coopenv.cars.backend.backend.FIRST_MESSAGES_TIME", 0.1)
+    hub, sent, seen = Hub(), list[str](), list[str]()
+    with closing(hub.connect()) as other:
+        other.subscribe("**", lambda arrival: sent.append(arrival.topic))
+        other.watch("**", lambda name, _: seen.append(name))
+        with closing(env_of(cars(write_fleet(tmp_path), hub, watch=watch))) as env:
+            env.reset(seed=0)
+            drive(env, 3)
+    assert (RESET_TOPIC in sent, bool(sent), bool(seen)) == (not watch,) * 3

@@ -12,7 +12,7 @@ from coopenv.cars.codec import stamp_of
 from coopenv.cars.fake import car
 from coopenv.cars.fake.settings import FAKE_FAULTS, CarFaults, fake_fault, fault_topic
 from coopenv.cars.profile import SVEA, Role
-from tests.helpers.fakes import EXACT, OVERTAKING, Stage
+from tests.helpers.fakes import CROSSING, EXACT, OVERTAKING, Stage
 
 
 @given(
@@ -151,3 +151,14 @@ def test_every_kind_can_be_asked_for_and_nonsense_is_reported(stage: Stage, caps
     error_lines = capsys.readouterr().err.splitlines()
     assert len(error_lines) == 3 and error_lines[0].startswith("svea7: unknown fault 'melt'")
     assert np.isfinite(stage.pose("svea7")[1]).all()
+
+
+def test_a_flood_of_unreadable_messages_fills_neither_log_nor_memory(capsys: pytest.CaptureFixture[str]) -> None:
+    stage = Stage("svea_crossing", CROSSING, EXACT)
+    for _ in range(20):
+        for _ in range(2 * car.MOST_WAITING):
+            stage.network.publish(fault_topic("svea7"), b"nonsense")
+        assert len(stage.cars["svea7"]._inbox) == car.MOST_WAITING
+        stage.run(0.001)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == car.MOST_LINES and lines[-1].endswith("; further errors are not printed")

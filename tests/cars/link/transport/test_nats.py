@@ -20,7 +20,7 @@ from coopenv.cars.codec import encode, make
 from coopenv.cars.deployment import parse_deployment
 from coopenv.cars.nats import MOST_WAITING, Letter, Outbox, open_nats, subject_of, subjects_of
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.transport import LEASE, HeartbeatTransport, LinkError, matcher
+from coopenv.cars.transport import LEASE, MOST_PRESENT, HeartbeatTransport, LinkError, matcher
 from coopenv.cars.zenoh import open_transport
 from tests.helpers.brokers import Authority, nats_server
 from tests.helpers.processes import wait_until
@@ -219,6 +219,20 @@ def test_a_name_is_there_while_any_of_its_ends_says_so(monkeypatch: pytest.Monke
     assert seen[1:] == [("fleet/alive/svea7", False)]
     ends[1].beat()
     assert seen[2:] == [("fleet/alive/svea7", True)]
+
+
+def test_names_of_strangers_take_limited_room_and_no_place_of_those_that_are_there() -> None:
+    watcher = End()
+    car = End(watcher)
+    seen = seen_by(watcher)  # type: ignore[arg-type]
+    car.announce("fleet/alive/svea7")
+    watcher.heartbeat("fleet/alive/" + 1000 * "x", b"+id")
+    for k in range(2 * MOST_PRESENT):
+        watcher.heartbeat(f"fleet/alive/mallory{k}", b"+id")
+    car.beat()
+    assert len(seen) == len(watcher._last) == MOST_PRESENT
+    car.close()
+    assert seen[-1] == ("fleet/alive/svea7", False)
 
 
 def letter(number: int) -> Letter:
