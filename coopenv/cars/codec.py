@@ -9,6 +9,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, message_types, needing
 from coopenv.cars.profile import IMAGES, SVEA, CarProfile
+from coopenv.cars.transport import MOST_BYTES
 
 TICK = "coopenv_msgs/msg/Tick"
 """Type of the marks in a file of a drive."""
@@ -16,8 +17,8 @@ TICK = "coopenv_msgs/msg/Tick"
 STOPPED = "coopenv_msgs/msg/Stopped"
 """Type of the message there with the reason for which the watchdog stopped the cars."""
 
-MOST_BYTES, MOST_FRAME = 65_536, 2**25
-"""Most bytes of a message, and of a camera frame."""
+MOST_FRAME = 2**25
+"""Bytes of a frame of a camera."""
 
 
 @cache

@@ -31,6 +31,7 @@ from coopenv.cars.profile import NEUTRAL, SVEA, CarProfile, CommandMessage, Limi
 ENCAPSULATION = b"\0\1\0\0"
 LONGEST_PADDING = 3  # bytes after the last field, which some writers add
 STAMP, TEXT = "S", "T"  # ns; UTF-8
+LIST = "[]"  # after a kind: any number of it
 KINDS = {
     **{"bool": "?", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H"},
     **{"int32": "i", "uint32": "I", "float32": "f", "float64": "d"},
@@ -43,10 +44,13 @@ class Malformed(CoopenvError):  # noqa: N818
 
 
 def read(payload: bytes, fields: Iterable[str]) -> list[Any]:
-    """Return the fields of CDR bytes: kinds of the module struct, `STAMP` or `TEXT`. Raises Malformed."""
+    """Return the fields of CDR bytes: kinds of the module struct, `STAMP` or `TEXT`, or a `LIST` of one.
+
+    Raises Malformed: the bytes are no such fields.
+    """
     if payload[:2] != ENCAPSULATION[:2] or len(payload) < len(ENCAPSULATION):
         raise Malformed("no little-endian CDR")
-    body, place, found = payload[len(ENCAPSULATION) :], 0, list[Any]()
+    body, place = payload[len(ENCAPSULATION) :], 0
 
     def number(kind: str) -> Any:
         nonlocal place
@@ -57,24 +61,29 @@ def read(payload: bytes, fields: Iterable[str]) -> list[Any]:
             raise Malformed("too short")
         return struct.unpack_from(f"<{kind}", body, start)[0]
 
-    for field in fields:
+    def value(field: str) -> Any:
+        nonlocal place
         if field == STAMP:
             seconds, nanoseconds = number("i"), number("I")
             if nanoseconds >= 10**9:
                 raise Malformed("a stamp has more than a second of nanoseconds")
-            found.append(seconds * 10**9 + nanoseconds)
-        elif field == TEXT:  # its length with the zero byte at its end, its bytes, the zero byte
-            length = number("I")
-            raw = body[place : place + length]
-            place += length
-            if len(raw) != length or raw[-1:] != b"\0":
-                raise Malformed("a text has no end")
-            try:
-                found.append(raw[:-1].decode())
-            except UnicodeDecodeError:
-                raise Malformed("a text is not UTF-8") from None
-        else:
-            found.append(number(field))
+            return seconds * 10**9 + nanoseconds
+        if field != TEXT:
+            return number(field)
+        length = number("I")  # with the zero byte at its end
+        raw = body[place : place + length]
+        place += length
+        if len(raw) != length or raw[-1:] != b"\0":
+            raise Malformed("a text has no end")
+        try:
+            return raw[:-1].decode()
+        except UnicodeDecodeError:
+            raise Malformed("a text is not UTF-8") from None
+
+    found = list[Any]()
+    for field in fields:
+        kind = field.removesuffix(LIST)
+        found.append(value(kind) if kind == field else [value(kind) for _ in range(number("I"))])
     if len(body) - place > LONGEST_PADDING:
         raise Malformed("too long")
     return found
@@ -87,7 +96,7 @@ def write(fields: Iterable[str], *values: Any) -> bytes:
     def put(kind: str, value: float) -> None:
         body.extend(bytes(-len(body) % struct.calcsize(kind)) + struct.pack(f"<{kind}", value))
 
-    for field, value in zip(fields, values, strict=True):
+    def add(field: str, value: Any) -> None:
         if field == STAMP:
             for kind, part in zip("iI", divmod(value, 10**9), strict=True):
                 put(kind, part)
@@ -97,6 +106,13 @@ def write(fields: Iterable[str], *values: Any) -> bytes:
             body.extend(raw)
         else:
             put(field, value)
+
+    for field, value in zip(fields, values, strict=True):
+        kind = field.removesuffix(LIST)
+        if kind != field:
+            put("I", len(value))
+        for each in value if kind != field else (value,):
+            add(kind, each)
     return ENCAPSULATION + bytes(body)
 
 
@@ -105,6 +121,8 @@ COMMAND = (STAMP, TEXT, *"fffff")
 ARM = (STAMP, TEXT, TEXT, TEXT, "?")
 """Arm: session, nonce, whether to arm or to disarm."""
 BOOL = ("?",)
+STATUS = (STAMP, *[TEXT] * 4, *"QQ", TEXT + LIST, "Q" + LIST)
+"""GateStatus: frame, session, nonce, state, accepted commands, last sequence number, reasons of refusals and counts."""
 
 
 def write_drive(stamp: int, message: CommandMessage, drive: MotionCommand) -> bytes:
@@ -125,9 +143,9 @@ def write_status(
     stamp: int, session: str, nonce: str, state: str, accepted: int, last_sequence: int, rejections: Mapping[str, int]
 ) -> bytes:
     """Return a coopenv_msgs/GateStatus; rejections are counts by reason."""
-    n, counts = len(rejections), rejections.values()
-    fields = (STAMP, *[TEXT] * 4, *"QQ", "I", *[TEXT] * n, "I", *"Q" * n)
-    return write(fields, stamp, "", session, nonce, state, accepted, last_sequence, n, *rejections, n, *counts)
+    return write(
+        STATUS, stamp, "", session, nonce, state, accepted, last_sequence, [*rejections], [*rejections.values()]
+    )
 
 
 class GateMode(StrEnum):

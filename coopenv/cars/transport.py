@@ -38,6 +38,9 @@ class Arrival:
     attachment: bytes = b""  # what came beside it: its signature
 
 
+MOST_BYTES = 65_536
+"""Of one message."""
+
 Callback = Callable[[Arrival], None]
 """Called in a thread of the transport: it is to keep the message and return."""
 

@@ -180,6 +180,7 @@ def health(
     car. On the car it connects to where the gate does, and tries from the deployment's network.connect. From elsewhere:
     --connect ROUTER --off-board.
     """
+    from coopenv.base.installation import install_command, needing
     from coopenv.cars.backend.station import BYPASSED, UNTRIED, Gates, neutral_command
     from coopenv.cars.deployment import load_deployment
     from coopenv.cars.gate import Reason
@@ -206,7 +207,8 @@ def health(
                 f"{car}: {cause}: from {v:.3g} m/s to a stand {after:.2g} s and {way:.2g} m, with safety.deceleration"
             )
         if seconds := (5.0 if off_board else 0.0) if clocks is None else clocks:
-            from coopenv.cars.backend.assembler import measured_clocks
+            with needing(f"clocks need an extra, or --clocks 0: {install_command('svea')}"):
+                from coopenv.cars.backend.assembler import measured_clocks
 
             for name, clock in measured_clocks(transport, fleet, car, seconds).items():
                 print(f"{car}: clock of {name}: {clock}")

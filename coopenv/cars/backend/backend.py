@@ -241,9 +241,9 @@ class Svea:
             self._judge(name, each)
             if self.deployment.safety.judge == "estimate" and self.monitor.settled(name):  # it jumps before
                 self.monitor.place(name, each.position + self._origin, moment)
-            self.gates.send(name, Role.ESTIMATE, estimate_message(each, moment, self._origin))
+            self.gates.send(name, Role.ESTIMATE, encode(estimate_message(each, moment, self._origin)))
             if (report := report_message(each, moment, self._origin)) is not None:
-                self.gates.send(name, Role.REPORT, report)
+                self.gates.send(name, Role.REPORT, encode(report))
 
     def _judge(self, name: str, sent: VehicleBroadcast) -> None:
         """Compare an estimate with the truth, the bearings and its own covariance at its tick."""

@@ -6,16 +6,12 @@ import time
 from collections import Counter, deque
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
-
-import numpy as np
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.codec import MOST_BYTES, decode, encode, header, make, stamp_of
-from coopenv.cars.gate import GateMode, Reason, write_drive
+from coopenv.cars.gate import ARM, BOOL, COMMAND, STATUS, GateMode, Malformed, Reason, read, write, write_drive
 from coopenv.cars.keys import Signer, Verifier
-from coopenv.cars.profile import GATE_TYPES, NEUTRAL, SVEA, CarProfile, Limits, Role
-from coopenv.cars.transport import Arrival, Transport
+from coopenv.cars.profile import NEUTRAL, SVEA, CarProfile, Limits, Role
+from coopenv.cars.transport import MOST_BYTES, Arrival, Transport
 
 MOST_WAITING = 256
 """Messages of one topic that wait for the next tick; older ones are dropped, so that a flood fills nothing."""
@@ -141,7 +137,8 @@ class Pacer:
 
     def late(self, share: float) -> float:
         """Return the lateness that a share of the ticks did not exceed, s; 0 where there were none."""
-        return float(np.quantile(self.lateness, share)) if self.lateness else 0.0
+        late = sorted(self.lateness)
+        return late[round(share * (len(late) - 1))] if late else 0.0
 
 
 PATIENCE = 1.0  # s for a gate to answer
@@ -225,21 +222,20 @@ class Gates:
             self.dropped[car][why] += 1
             return
         try:
-            m = decode(arrival.payload, GATE_TYPES[Role.GATE])
-            mode = GateMode(m.state)
-        except (CoopenvError, ValueError):
+            stamp, _, session, nonce, state, accepted, _, reasons, numbers = read(arrival.payload, STATUS)
+            mode = GateMode(state)
+        except (Malformed, ValueError):
             self.dropped[car]["malformed"] += 1
             return
-        stamp = stamp_of(m)
         if not -AHEAD <= arrival.received - stamp <= LATE:
             self.dropped[car]["stale" if stamp < arrival.received else "future"] += 1
             return
-        counts = Counter(dict(zip(m.rejections, map(int, m.counts), strict=False)))
+        counts = Counter(dict(zip(reasons, numbers, strict=False)))
         with self._lock:
             if stamp < self._states[car].stamp:
                 self.dropped[car]["out of order"] += 1
                 return
-            known = mode, m.session, m.nonce, stamp, counts, int(m.accepted)
+            known = mode, session, nonce, stamp, counts, accepted
             self._states[car] = GateState(*known, time.monotonic())
             if mode is GateMode.STOPPED and not self._stopping:
                 self.stopped_by_others.add(car)
@@ -305,39 +301,31 @@ class Gates:
         self.session = ""
 
     def _arm(self, car: str, armed: bool, nonce: str) -> None:
-        message = make(
-            GATE_TYPES[Role.ARM], header=header(time.time_ns()), session=self.session, nonce=nonce, armed=armed
-        )
-        self.send(car, Role.ARM, message)
+        self.send(car, Role.ARM, write(ARM, time.time_ns(), "", self.session, nonce, armed))
 
     def stop(self) -> None:
         """Stop every gate at once, until the next arming."""
         with self._lock:
             self._stopping = True
         for car in self._states:
-            self.send(car, Role.STOP, make(GATE_TYPES[Role.STOP], data=True))
+            self.send(car, Role.STOP, write(BOOL, True))
 
     def command(self, car: str, speed: float, steering: float, acceleration: float) -> None:
         """Send a command: m/s, rad, m/s^2, clipped to the limits."""
         limits = self._limits
         speed = min(max(speed, -limits.speed if limits.reverse else 0.0), limits.speed)
         steering = min(max(steering, -limits.steering), limits.steering)
-        drive = {
-            "steering_angle": steering,
-            "steering_angle_velocity": limits.steering_rate,
-            "speed": speed,
-            "acceleration": min(acceleration, limits.acceleration),
-        }
-        about = header(time.time_ns(), f"{self.session}:{self._sequence}")
-        self.send(car, Role.COMMAND, make(GATE_TYPES[Role.COMMAND], header=about, drive=drive))
+        numbers = steering, limits.steering_rate, speed, min(acceleration, limits.acceleration), 0.0
+        frame = f"{self.session}:{self._sequence}"
+        self.send(car, Role.COMMAND, write(COMMAND, time.time_ns(), frame, *numbers))
 
     def next(self) -> None:
         """Begin the commands of the next decision."""
         self._sequence += 1
 
-    def send(self, car: str, role: Role, message: Any) -> None:
+    def send(self, car: str, role: Role, payload: bytes) -> None:
         """Send a message on a topic of a car, signed."""
-        topic, payload = self.profile.topic_of(car, role), encode(message)
+        topic = self.profile.topic_of(car, role)
         signature = b"" if self._signer is None else self._signer.sign(topic, payload)
         kind = self.profile.topics[role]
         self._transport.publish(topic, payload, signature, urgent=kind.urgent, reliable=kind.reliable)
