@@ -1,4 +1,4 @@
-"""Which topics of cars are read, and constants of `coopenv calibrate` that correct them, live and in bags.
+"""Topics of cars that are read, and constants of `coopenv calibrate` that correct them, live and in bags.
 
 Needs no NumPy, like the gate.
 """
@@ -27,11 +27,11 @@ class Correction(Section):
     """Constants of a car, as `coopenv calibrate` finds them."""
 
     focal_length: PositiveVector2 | None = None
-    """Of its camera, instead of that of CameraInfo, px."""
+    """Focal length of its camera, instead of CameraInfo's, px."""
     principal_point: Vector2 | None = None
-    """Of its camera, px."""
+    """Principal point of its camera, px."""
     distortion: tuple[Number, ...] | None = None
-    """Of its camera: 5 coefficients, 8, or 4 of a fisheye."""
+    """Distortion of its camera: 5 or 8 coefficients, or 4 of a fisheye."""
     wheel_scale: float = Field(default=0.0, gt=-1.0, le=10.0)
     """Relative error of its speeds, removed."""
     gyro_bias: Number = 0.0
@@ -60,7 +60,7 @@ Lead = Annotated[float, Field(ge=-2.0, le=2.0)]
 
 
 class Sensors(Section):
-    """Which topics are read."""
+    """Topics that are read."""
 
     odometry: Literal["wheel+imu", "wheel", "odometry"] = "wheel+imu"
     """Source of the body twist: speed of the wheels and turn rate of the IMU, the wheels alone, or the car's own
@@ -69,17 +69,17 @@ class Sensors(Section):
     """`detections`: pixels, from which distortion is removed on this computer; `bearings`: unit vectors of the authors'
     node."""
     distorted: bool = True
-    """Whether `bearings` come from pixels with distortion, as the authors' do."""
+    """Treat `bearings` as computed from distorted pixels, as the authors' are."""
     truth: bool = True
-    """Whether motion capture is read. It serves infos, metrics and safety, never observations."""
+    """Read motion capture. It serves infos, metrics and safety, never observations."""
     corrections: dict[Name, Correction] = Field(default={})
     """Constants by the name of a car, see `calibration`."""
     leads: dict[TopicName, Lead] = Field(default={})
-    """By how much the stamps of a topic are too early in every drive, s: added."""
+    """Time added to the stamps of a topic in every drive, s."""
 
     @property
     def roles(self) -> tuple[Role, ...]:
-        """Of the topics of a car that are read."""
+        """Roles of the topics that are read."""
         return (*VELOCITY[self.odometry], Role(self.detections), *([Role.TRUTH] if self.truth else []))
 
 
@@ -100,7 +100,7 @@ class CalibratedConstant(Section):
 
 
 class CalibrationFile(Section):
-    """What `coopenv calibrate` writes."""
+    """Calibration file of `coopenv calibrate`."""
 
     overrides: dict[str, Any]
     clocks: CalibratedClocks

@@ -286,7 +286,7 @@ class Intake:
         self.calibrations = {
             name: right.get(name, Correction()).lens(Calibration.of(cameras[i])) for name, i in binding.cars.items()
         }
-        """Of the environment, corrected, by car."""
+        """Calibrations of the environment, corrected, by car."""
         truth: tuple[Role, ...] = (Role.TRUTH,) if sensors.truth else ()
         roles = {
             name: sensors.roles if i in binding.local else (*truth, *BROADCAST) for name, i in binding.cars.items()
