@@ -1,7 +1,8 @@
 """Backends of many worlds at once: the simulation, and the replay of a recording in a scenario that is made of it."""
 
 import math
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -11,14 +12,15 @@ import warp as wp
 
 from coopenv.backends.base import Capabilities, Episode, SensingWorld, TickGenerator
 from coopenv.backends.feed import RECORDED, Feed
-from coopenv.base.errors import CoopenvError, DataError
+from coopenv.base.errors import CoopenvError, DataError, ScenarioWarning
 from coopenv.estimation import Sight
 from coopenv.observers.contract import ObserverInit, sealed
-from coopenv.observers.recording import Recording, Sensed, Truth, check_recording, is_due
+from coopenv.observers.recording import ARRAYS, Recording, Sensed, Truth, check_recording, is_due, recorded_arrays
 from coopenv.observers.registry import find_embedded
 from coopenv.observers.runner import start_covariances
 from coopenv.scenario import Scenario, parse_scenario
 from coopenv.scenario.files import override
+from coopenv.scenario.schema import neighbour_sets, processing_order
 from coopenv.world.embedded import HOST
 
 
@@ -226,6 +228,67 @@ def _of_robots(recording: Recording, name: str) -> dict[str, Any]:
     }
 
 
+def of_robots(recording: Recording, kept: Sequence[int]) -> Recording:
+    """Return a recording in which the robots that are not kept have no neighbours and no truth."""
+    out = np.array([i not in kept for i in range(len(recording.setups))])
+    gone, seen = recording.setups[0].landmarks + np.flatnonzero(out), recording.visible.copy()
+    seen[:, out], seen[..., gone] = False, False
+    setups = tuple(
+        replace(setup, targets=np.setdiff1d(setup.targets, gone) if i in kept else setup.targets[:0])
+        for i, setup in enumerate(recording.setups)
+    )
+    truth = Truth(*(np.array(values) for values in (recording.truth.rotation, recording.truth.position)))
+    truth.rotation[:, out], truth.position[:, out] = np.nan, np.nan
+    scenario, order = without_robots(recording.scenario, kept), recording.order
+    if scenario is not None:
+        order = tuple(processing_order(scenario, neighbour_sets(scenario)))
+    bearings = np.where(seen[..., None], recording.bearings, np.nan)
+    return replace(
+        recording, setups=setups, visible=seen, bearings=bearings, truth=truth, scenario=scenario, order=order
+    )
+
+
+def without_robots(scenario: Any, kept: Sequence[int]) -> Any:
+    """Return a scenario in which only the vehicles kept have neighbours, each among the kept; None of None."""
+    if scenario is None or len(kept) == len(scenario.vehicles):
+        return scenario
+    names, L = scenario.target_names, len(scenario.landmarks)
+    neighbours = [
+        tuple(names[n] for n in targets if n < L or n - L in kept) if i in kept else ()
+        for i, targets in enumerate(neighbour_sets(scenario))
+    ]
+    vehicles = [v.model_copy(update={"neighbours": n}) for v, n in zip(scenario.vehicles, neighbours, strict=True)]
+    with warnings.catch_warnings(action="ignore", category=ScenarioWarning):  # of vehicles without neighbours
+        return scenario.model_copy(update={"vehicles": tuple(vehicles)})
+
+
+def stretch(recording: Recording, first: int, last: int, where: str) -> Recording:
+    """Return the ticks from `first` to `last` of a recording."""
+    if first and recording.interference is not None:
+        raise DataError(f"{where}: from: its scenario has faults, whose times count from its own start")
+    truth, judged, cut = recording.truth, ~recording.left_out, slice(first, last + 1)
+    known = np.asarray(truth.known[:, judged].all(axis=1))
+    if first and not known[first]:
+        later = np.flatnonzero(known[first:])
+        hint = f"; they are at {(first + later[0]) * recording.dt:g} s" if len(later) else ""
+        raise DataError(f"{where}: from: true poses of all robots are not known at {first * recording.dt:g} s{hint}")
+    names = [name for name in recorded_arrays(recording) if ARRAYS[name].axes[0] == "K" and "." not in name]
+    arrays: dict[str, Any] = {name: np.array(getattr(recording, name)[cut]) for name in names}
+    arrays["rotation"][0], arrays["translation"][0] = np.eye(3), 0.0
+    arrays["inbox_tick"] = np.where(arrays["inbox_tick"] >= first, arrays["inbox_tick"] - first, -1)
+    arrays["due"] = recording.due[: last + 1 - first]
+    if first:
+        R, p = np.array(recording.start_rotation), np.array(recording.start_position)
+        for i in np.flatnonzero(judged):
+            begin, now = ((truth.rotation[k, i], truth.position[k, i]) for k in (0, first))
+            if not truth.known[0, i]:
+                begin = R[i], p[i]
+            moved = now[0] @ begin[0].T
+            R[i], p[i] = moved @ R[i], now[1] + moved @ (p[i] - begin[1])
+        arrays |= {"start_rotation": R, "start_position": p}
+    return replace(recording, truth=Truth(truth.rotation[cut], truth.position[cut]), **arrays)
+
+
 class ReplayWorld(SensingWorld):
     """A world whose truth, measurements and deliveries are recorded."""
 
@@ -269,8 +332,9 @@ class Replay(TickGenerator):
         self.recording = recording
         scenario, known = scenario_of(recording, name, overrides or {}), bool(recording.truth.known.any())
         ticks = scenario.horizon_ticks + 1
-        abilities = Capabilities(truth=known, driven=False, real_time=False, ticks=ticks, batched=True, recorded=True)
-        super().__init__(scenario, abilities)
+        out = recording.left_out
+        here = tuple(np.flatnonzero(~out).tolist()) if out.any() and not out.all() else None
+        super().__init__(scenario, Capabilities(known, False, False, ticks, True, True, here))
 
     def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> ReplayWorld:
         """Return worlds that go through the recording."""

@@ -77,7 +77,7 @@ def describe(given: DescribeOptions) -> None:
     from coopenv.runs.summary import describe_scenario, document, summary
 
     name = Path(given.environment).stem
-    if is_recorded(given.environment) or any((given.data, given.variant, given.topics)):
+    if is_recorded(given.environment) or any((given.data, given.variant, given.topics, given.selection.given)):
         backend = given.open()
         scenario, recorded = backend.scenario, backend.capabilities.recorded
     else:

@@ -75,7 +75,9 @@ class ObserverOptions:
         str | None,
         typer.Option("--policy", "--agent", help="Agent or policy that drives in the records.", **options.POLICY),
     ] = None
-    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 5
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="Number of seeds (default: 5; recorded robots and logs have one record).")
+    ] = None
     first: First = 0
     jobs: Annotated[
         int | None,
@@ -92,6 +94,9 @@ class ObserverOptions:
     ] = None
     data: options.DataFolder = None
     topics: options.TopicMap = None
+    start: options.From = None
+    until: options.Until = None
+    robots: options.Robots = None
     basin: Annotated[int, typer.Option(min=0, help="Random initial estimates for maps of the basins.")] = 0
     overrides: options.Overrides = None
     steady_from: options.SteadyFrom = None
@@ -118,12 +123,14 @@ class ObserverOptions:
 
     def plan(self) -> "Plan":
         """Return the comparison, everything in it checked."""
-        from coopenv.bench.observers.comparison import Plan
+        from coopenv.backends.sources import Selection
+        from coopenv.bench.observers.comparison import SEEDS, Plan
         from coopenv.bench.observers.sources import find_source
 
         changes = options.parse_overrides(self.overrides)
-        source = find_source(self.source, changes, self.data, self.topics, self.faults or (), self.policy)
-        seeds = range(self.first, self.first + self.seeds)
+        chosen = Selection.of(self.start, self.until, self.robots)
+        source = find_source(self.source, changes, self.data, self.topics, self.faults or (), self.policy, chosen)
+        seeds = range(self.first, self.first + (self.seeds or SEEDS)) if self.seeds or self.first else None
         return Plan.of(self.names, source, seeds, self.variants, self.steady_from, self.windows)
 
     def command_of(self, plan: "Plan") -> str:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from coopenv.backends.base import Backend
+    from coopenv.backends.sources import Selection
 
 PLAIN = ("zero", "random")
 """Policies without an agent."""
@@ -213,6 +214,17 @@ DataFolder = Annotated[
 ]
 Variant = Annotated[
     str | None, typer.Option("--variant", help="Variant of a data set: landmarks, landmarks+robots or blind.")
+]
+From = Annotated[
+    float | None, typer.Option("--from", help="Time at which the part of recorded data that is used begins, s.")
+]
+Until = Annotated[float | None, typer.Option("--until", help="Time at which it ends, s.")]
+Robots = Annotated[
+    str | None,
+    typer.Option(
+        "--robots",
+        help="Recorded robots that are used, names or numbers with commas between, such as 1,3 (default: all).",
+    ),
 ]
 TopicMap = Annotated[
     Path | None, typer.Option("--map", help="TOML file with the map of a ROS bag's topics (docs/bags.md).")
@@ -396,6 +408,16 @@ class SourceOptions:
     data: DataFolder = None
     variant: Variant = None
     topics: TopicMap = None
+    start: From = None
+    until: Until = None
+    robots: Robots = None
+
+    @property
+    def selection(self) -> Selection:
+        """The part of recorded data that is used."""
+        from coopenv.backends.sources import Selection
+
+        return Selection.of(self.start, self.until, self.robots)
 
     @property
     def changes(self) -> dict[str, Any]:
@@ -406,7 +428,8 @@ class SourceOptions:
         """Return the source of ticks."""
         from coopenv.backends.sources import open_backend
 
-        return open_backend(self.environment, None, self.changes, self.data, self.variant, topics=self.topics)
+        known: dict[str, Any] = {"topics": self.topics, "selection": self.selection}
+        return open_backend(self.environment, None, self.changes, self.data, self.variant, **known)
 
 
 def console(stderr: bool = False) -> Console:

@@ -204,9 +204,10 @@ def record(given: RecordOptions) -> None:
     if replayed:
         if given.changes:
             raise CoopenvError(f"--override: is for a simulation, {environment} is recorded")
-        recording = open_recording(environment, given.data, given.variant)
+        recording = open_recording(environment, given.data, given.variant, given.selection)
     else:
-        for option, value in () if bag else (("--data", given.data), ("--variant", given.variant)):
+        chosen = {"data": given.data, "variant": given.variant, **given.selection.given}
+        for option, value in () if bag else ((f"--{name}", value) for name, value in chosen.items()):
             if value is not None:
                 raise CoopenvError(f"{option} {value}: is for recorded data, {environment} is simulated")
         backend = given.open()
@@ -222,7 +223,8 @@ def record(given: RecordOptions) -> None:
         played = keepers[0].record()
     else:
         with warnings.catch_warnings(action="ignore", category=DataWarning):  # these have been printed
-            backend = open_source(environment, {}, observer or observer_of(recording), given.data, given.variant)
+            shown = observer or observer_of(recording)
+            backend = open_source(environment, {}, shown, given.data, given.variant, selection=given.selection)
             whole = backend.scenario.horizon
             first = f", first {MOST_SHOWN:g} s of {whole:.0f} s" if whole > MOST_SHOWN else ""
             played = played_scene(backend, title_of(environment) + first, log, longest=MOST_SHOWN)

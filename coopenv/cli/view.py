@@ -64,7 +64,7 @@ class SceneOptions(options.SourceOptions):
             raise CoopenvError(f"--agent: is for a simulation, {self.environment} is recorded")
         changes = {**self.changes, **(more or {})}
         observer = (more or {}).get("observer.name", self.observer)
-        return open_source(self.environment, changes, observer, self.data, self.variant, self.topics)
+        return open_source(self.environment, changes, observer, self.data, self.variant, self.topics, self.selection)
 
     def driver(self, scenario: "Scenario") -> "tuple[Policy | None, str]":
         """Return the driver of a scenario, and its name. Raises CoopenvError: it cannot drive here."""

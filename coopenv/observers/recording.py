@@ -166,6 +166,12 @@ class Recording(Measurements):
         return int(lag[arrived].max(initial=0))
 
     @property
+    def left_out(self) -> NDArray[np.bool_]:
+        """(N,) vehicles without neighbours and truth, as those are that a selection leaves out."""
+        alone = np.array([not setup.targets.size for setup in self.setups])
+        return np.asarray(alone & ~self.truth.known.any(axis=0))
+
+    @property
     def on_a_plane(self) -> bool:
         """True if recorded robots drive on the plane z = 0, so that errors out of it vanish and are not judged."""
         if all(setup.planar for setup in self.setups):

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console, ConsoleOptions, RenderResult
 
 from coopenv.backends.base import Repeating
-from coopenv.backends.sources import open_backend
+from coopenv.backends.sources import Selection, open_backend, source_name
 from coopenv.base.columns import WIDTH, Columns, Tabular, one_line, picture_html, terminal_html
 from coopenv.base.errors import CoopenvError, DataError, checked_seed, explained, listed
 from coopenv.base.files import new_folder, replace_text, replacing_folder
@@ -31,12 +31,14 @@ from coopenv.runs.console import Progress, compile_notice, estimates_table, gaps
 from coopenv.runs.films import VIDEO_FILES, top_view_film, video_path, write_film
 from coopenv.runs.rollouts import Rollout, estimates, run_metrics, theory_rates, vehicle_metrics
 from coopenv.runs.scenes import Keeper, frame_stride, source_of, write_page
-from coopenv.scenario import Scenario, ScenarioLike, load_scenario, scenario_name
+from coopenv.scenario import Scenario, ScenarioLike, load_scenario
 from coopenv.viz import FIGURE_NAMES, FORMATS
 from coopenv.viz.scene import SCENE_FILE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from coopenv.observers.recording import Recording
 
 METRICS_FILE, TRAJECTORY_FILE, REPLAY_FILE = "metrics.json", "trajectory.npz", "replay.html"
 
@@ -153,7 +155,7 @@ def _kept_if_failed(record: RunRecord | None, out: Path | None, name: str, log: 
 
 @partial(explained, hint="; several seeds or observers: coopenv.compare")
 def run(
-    environment: ScenarioLike,
+    environment: "ScenarioLike | Recording",
     seed: int = 0,
     *,
     policy: str | Policy = "zero",
@@ -165,6 +167,9 @@ def run(
     data: str | Path | None = None,
     variant: str | None = None,
     topics: str | Path | None = None,
+    start: float | None = None,
+    until: float | None = None,
+    robots: Sequence[str | int] | None = None,
     device: str = "cpu",
     dtype: str = "float64",
 ) -> "Results":
@@ -173,7 +178,8 @@ def run(
     For example `coopenv.run("facade", seed=1, policy="peek", observer="robust").trajectory.to_pandas()`.
 
     Args:
-        environment: name, TOML file, dict or scenario, as for `coopenv.load_scenario`, or a recording.
+        environment: name, TOML file, dict or scenario, as for `coopenv.load_scenario`, or recorded data: an MCAP file,
+            a ROS bag, `mrclam_6`, or a `Recording`.
         seed: of all that is drawn.
         policy: of driven vehicles: "zero", "random", or what `coopenv.policies.find_agent` takes.
         observer: name, class or import path; None: that of the scenario.
@@ -184,6 +190,9 @@ def run(
         data: folder of recorded data sets.
         variant: of a data set.
         topics: TOML file with the map of a ROS bag's topics.
+        start: begin of the part of recorded data that is used, s.
+        until: its end, s.
+        robots: recorded robots that are used, by name or number; None: all.
         device: "cpu" or a CUDA device.
         dtype: "float32" or "float64".
 
@@ -191,10 +200,11 @@ def run(
         CoopenvError: an argument is not valid, or the results cannot be written.
     """
     changes, log = with_observer(overrides, observer), Terminal(stderr=True)
-    backend = open_backend(environment, None, changes, data, variant, topics=topics)
+    chosen = Selection.of(start, until, robots)
+    backend = open_backend(environment, None, changes, data, variant, topics=topics, selection=chosen)
     with compile_notice(log):
         made = Rollout(backend.scenario, checked_seed(seed), steps, dtype, device, policy, backend)
-    name, folder = scenario_name(environment), None if out is None else Path(out)
+    name, folder = source_name(environment), None if out is None else Path(out)
     return execute(name, made, folder, log, changes, steady_from, "png")
 
 
@@ -211,7 +221,8 @@ def report(run: Rollout, result: "Results", folder: Path, out: Console) -> None:
     out.print()
     out.print(result)
     if others := [name for i, name in enumerate(run.scenario.vehicle_names) if i not in run.vehicles]:
-        out.print(f"{listed(others)}: received by radio, not estimated here", soft_wrap=True)
+        why = "left out" if able.recorded else "received by radio, not estimated here"
+        out.print(f"{listed(others)}: {why}", soft_wrap=True)
     out.print(f"Outcome: {metrics['outcome']}. {done}.")
     if isinstance(run.engine.backend, Repeating) and run.engine.backend.stopped:
         out.print(f"Stopped: {run.engine.backend.stopped}", soft_wrap=True, markup=False)

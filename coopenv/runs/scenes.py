@@ -16,7 +16,7 @@ from rich.console import Console
 from coopenv.api.engine import Engine
 from coopenv.backends.base import Backend
 from coopenv.backends.mcap import write_recording
-from coopenv.backends.sources import SourceKind, kind_of, open_backend
+from coopenv.backends.sources import WHOLE, Selection, SourceKind, kind_of, open_backend
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, list_envs
 from coopenv.evaluation.episodes import play
@@ -166,6 +166,7 @@ def open_source(
     data: Path | None = None,
     variant: str | None = None,
     topics: Path | None = None,
+    selection: Selection = WHOLE,
 ) -> Backend:
     """Return the source of ticks of a name: an environment, a log file, a bag or a data set.
 
@@ -174,7 +175,9 @@ def open_source(
     """
     if observer is not None:
         find(named(observer))  # before anything is read
-    return open_backend(name, None, with_observer(overrides, observer), data, variant, topics=topics)
+    return open_backend(
+        name, None, with_observer(overrides, observer), data, variant, topics=topics, selection=selection
+    )
 
 
 def title_of(name: str) -> str:

@@ -104,6 +104,7 @@ def document(board: Leaderboard, command: str) -> dict[str, Any]:
     """Return the content of `leaderboard.json`."""
     packages = versions("coopenv", "numpy", "scipy", "warp-lang")
     content = {"command": command, "versions": packages, "seeds": board.seeds, "rows": board.rows}
+    content |= {"standard_errors_over": board.sampled}
     content["windows"] = board.window_rows
     return dict(jsonable(content | ({"basin": board.basins} if board.basins else {})))
 

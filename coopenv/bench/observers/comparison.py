@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, product
@@ -11,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
+from coopenv.backends.sources import Selection
 from coopenv.base.columns import Columns, Tabular, one_line, picture_html, terminal_html, written
-from coopenv.base.errors import CoopenvError, check_one_of, checked_seed, explained
+from coopenv.base.errors import CoopenvError, DataWarning, check_one_of, checked_seed, explained
 from coopenv.base.installation import names_of
 from coopenv.base.terminal import Terminal, text_of
 from coopenv.bench.executors import Executor, Local
@@ -27,6 +29,12 @@ from coopenv.scenario import ScenarioLike
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from coopenv.observers.recording import Recording
+
+
+SEEDS = 5
+"""Number of seeds by default."""
 
 
 class Comparison(Leaderboard, Tabular):
@@ -143,8 +151,8 @@ class Comparison(Leaderboard, Tabular):
 @explained
 def compare(
     observers: str | Factory | Iterable[str | Factory] | None,
-    environment: ScenarioLike,
-    seeds: int | Iterable[int] = 5,
+    environment: ScenarioLike | Recording,
+    seeds: int | Iterable[int] | None = None,
     *,
     variants: str | Sequence[str] | None = None,
     overrides: Mapping[str, Any] | None = None,
@@ -152,6 +160,9 @@ def compare(
     windows: Sequence[float] | None = None,
     data: str | Path | None = None,
     topics: str | Path | None = None,
+    start: float | None = None,
+    until: float | None = None,
+    robots: Sequence[str | int] | None = None,
     faults: Sequence[str] = (),
     policy: str | None = None,
     jobs: int = 1,
@@ -164,8 +175,9 @@ def compare(
         observers: one or several names, classes, or import paths (`mine.py:Mine`, `package.module:Mine`); None: all
             that suit.
         environment: name, TOML file, dict or scenario, as for `coopenv.load_scenario`; recorded robots (`mrclam_1`,
-            `mrclam_1_space`, ...), MCAP file or ROS bag.
-        seeds: their number (0, 1, ...), or a list; recorded data have one record for any seeds.
+            `mrclam_1_space`, ...), MCAP file, ROS bag or `Recording`.
+        seeds: how many (0, 1, ...), or which; None: 5. Of a bag they draw the initial estimates; other recorded data
+            are one record.
         variants: names, or "all": faults of an environment, what recorded robots see; None: the usual ones.
         overrides: dotted scenario keys, for example {"noise.enabled": False}.
         steady_from: start of the steady state, s; None: after 70 % of the run.
@@ -173,6 +185,9 @@ def compare(
             robots none.
         data: folder of recorded data sets; None: the variable COOPENV_DATA.
         topics: TOML file with the map of a ROS bag's topics.
+        start: begin of the part of recorded data that is used, s.
+        until: its end, s.
+        robots: recorded robots that are used, by name or number; None: all.
         faults: further variants with parameters, such as "vehicle_2:lie=drift:0.05@10", see docs/observers.md.
         policy: agent or policy that drives in the records of an environment; None: action zero.
         jobs: processes. More than one need a script whose own work stands below `if __name__ == "__main__":`, and
@@ -183,7 +198,7 @@ def compare(
     """
     if isinstance(environment, str) and environment in list_observers():
         raise CoopenvError(f"compare: environment '{environment}' is an observer; observers come first")
-    source = find_source(environment, overrides, data, topics, faults, policy)
+    source = find_source(environment, overrides, data, topics, faults, policy, Selection.of(start, until, robots))
     plan = Plan.of(observers, source, seeds, variants, steady_from, windows)
     plan.source.check()
     with Progress(Terminal(stderr=True), plan.work, total=1.0) as progress:
@@ -210,17 +225,19 @@ class Plan:
         cls,
         observers: Iterable[str | Factory] | None,
         source: RecordSource,
-        seeds: int | Iterable[int],
+        seeds: int | Iterable[int] | None,
         variants: str | Sequence[str] | None = None,
         steady_from: float | None = None,
         windows: Sequence[float] | str | None = None,
     ) -> Plan:
         """Return a checked plan for a source; the other arguments, and errors, as for `compare`."""
         names, chosen = _observers(observers, source), variants_of(source, variants)
-        given = seeds if isinstance(seeds, Iterable) else range(checked_seed(seeds))
+        given = seeds if isinstance(seeds, Iterable) else range(checked_seed(SEEDS if seeds is None else seeds))
         numbers = tuple(dict.fromkeys(map(checked_seed, given)))
         if not numbers:
             raise CoopenvError("seeds: expected at least one")
+        if seeds is not None and not source.seeded and numbers != (0,):
+            warnings.warn(DataWarning(f"{source.name}: one recording, in which seeds draw nothing"), stacklevel=2)
         edges = (
             checked_edges(windows) if windows is not None else EDGES if source.windowed and not source.planar else ()
         )
@@ -268,7 +285,9 @@ class Plan:
         order = list(product(self.variants, self.observers))
         samples = sorted(chain(*judged), key=lambda sample: order.index((sample.variant, sample.observer)))
         summaries = {variant: self.source.variants[variant] for variant in self.variants}
-        return Comparison(self.source.name, self.observers, summaries, self._used, samples)
+        return Comparison(
+            self.source.name, self.observers, summaries, self._used, samples, recorded=self.source.recorded
+        )
 
 
 def _observers(observers: Iterable[str | Factory] | None, source: RecordSource) -> tuple[str, ...]:

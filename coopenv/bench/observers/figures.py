@@ -113,7 +113,7 @@ def nees_figure(board: Leaderboard, variant: str, width: float | None = None) ->
     if not groups:
         return None
     first = board.samples[0]
-    scene, runs, dof = first.scene, len(board.seeds), first.nees_dof
+    scene, runs, dof = first.scene, board.runs, first.nees_dof
     columns = style.fitting(width or style.PAGE, 3.0, min(3, len(groups)))
     rows = -(-len(groups) // columns)
     figure, _ = style.canvas(width, _FRAME + 1.5 * rows, f"{board.title}, {variant}")
@@ -324,7 +324,7 @@ def _document(board: Leaderboard) -> dict[str, Any]:
         "colours": VEHICLE_COLOURS,
         "shown": SHOWN,
         "dof": sample.nees_dof,
-        "band": [float(end) for end in mean_bounds(sample.nees_dof, len(board.seeds))],
+        "band": [float(end) for end in mean_bounds(sample.nees_dof, board.runs)],
         "variants": [_variant(board, name, points) for name in board.variants],
         "cost": _cost(board, first),
     }

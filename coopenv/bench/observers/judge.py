@@ -2,7 +2,7 @@
 
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from itertools import compress, pairwise
 from types import MappingProxyType
@@ -28,7 +28,7 @@ from coopenv.estimation.observability import RecordedGeometry, analyse_observabi
 from coopenv.estimation.poses import Array
 from coopenv.observers.bound import Bound, cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Factory
-from coopenv.observers.recording import Recording
+from coopenv.observers.recording import Recording, Truth
 from coopenv.observers.runner import PLANAR_STATES, Run, run
 
 STEADY = "steady"
@@ -137,8 +137,12 @@ def scene_of(recording: Recording, steady_from: float, edges: Sequence[float] = 
     The noise of recorded robots is not known, and so neither is their bound.
     """
     names = tuple(setup.name for setup in recording.setups)
-    kept, known = kept_ticks(recording), bool(recording.truth.known.all())
+    kept, known = kept_ticks(recording), bool(recording.truth.known[:, ~recording.left_out].all())
     windows = windows_of(edges, steady_from, float(recording.t[-1]))
+    if (out := recording.left_out).any():  # at any pose, as they have no part in measurements
+        R, p = (np.array(values) for values in (recording.truth.rotation, recording.truth.position))
+        R[:, out], p[:, out] = np.eye(3), 0.0
+        recording = replace(recording, truth=Truth(R, p))
     within = np.full((len(BOUNDS), len(names), len(windows)), np.nan)
     bound, gramians = np.full((len(kept), len(names)), np.nan), np.full((2, len(names)), np.nan)
     if known and not recording.on_a_plane:
@@ -151,9 +155,9 @@ def scene_of(recording: Recording, steady_from: float, edges: Sequence[float] = 
         seen = analyse_observability(_geometry(recording))
         gramians = np.array([v.min(axis=0, initial=np.inf) for v in (seen.min_eigenvalue, seen.local_eigenvalue)])
     paper_noise = any(setup.noise.image_axis is not None for setup in recording.setups)
-    judged = judged_vehicles(recording)
+    judged = judged_vehicles(recording) & ~out
     arrays = within[:, judged], gramians[:, judged], recording.t[kept], bound[:, judged]
-    own, others = (tuple(compress(names, part)) for part in (judged, ~judged))
+    own, others = (tuple(compress(names, part)) for part in (judged, ~(judged | out)))
     return RecordProperties(own, windows, *arrays, paper_noise, figures_of(recording), others)
 
 

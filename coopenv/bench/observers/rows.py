@@ -172,8 +172,12 @@ BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", 
 """Column to its line in tables."""
 
 
-def row_of(environment: str, own: Sequence[JudgedRun], nominal: Sequence[JudgedRun], i: int, w: int = -1) -> Row:
+def row_of(
+    environment: str, own: Sequence[JudgedRun], nominal: Sequence[JudgedRun], i: int, w: int = -1, runs: int = 1
+) -> Row:
     """Sum up samples of one observer in one variant over seeds, of vehicle `i` in window `w` (-1: the steady state).
+
+    `runs` is how many of them are independent, for the bounds of consistency.
 
     Columns that no `WindowRow` has are of the steady state or the whole run in any window.
     """
@@ -196,8 +200,8 @@ def row_of(environment: str, own: Sequence[JudgedRun], nominal: Sequence[JudgedR
         "degradation": position.degradation,
     }
     each = np.sqrt(seeds("position_mse"))
-    honest = mean_bounds(own[0].nees_dof, len(own)) if np.isfinite(anees).all() else NOWHERE
-    consistent = mean_bounds(int(dof)) if dof > 0 else NOWHERE
+    honest = mean_bounds(own[0].nees_dof, runs) if np.isfinite(anees).all() else NOWHERE
+    consistent = mean_bounds(int(dof * runs / len(own))) if dof > 0 else NOWHERE
     return Row(
         environment=environment,
         variant=own[0].variant,
@@ -305,8 +309,20 @@ class Leaderboard:
     seeds: tuple[int, ...]
     samples: Sequence[JudgedRun] = field(repr=False)
     """One observer on one record each, by variant, observer, seed."""
+    recorded: bool = False
+    """Whether all seeds have the same recording, in which they draw the initial estimates alone."""
     draws: Sequence[Draw] = field(default=(), repr=False)
     """Draws of initial estimates, by observer, where basins were studied."""
+
+    @property
+    def sampled(self) -> str:
+        """What standard errors are over."""
+        return "drawn starts of one recording" if self.recorded else "seeds"
+
+    @property
+    def runs(self) -> int:
+        """How many independent records there are."""
+        return 1 if self.recorded else len(self.seeds)
 
     @cached_property
     def groups(self) -> dict[tuple[str, str], list[JudgedRun]]:
@@ -317,7 +333,7 @@ class Leaderboard:
     def rows(self) -> list[Row]:
         """One row per variant, observer and vehicle."""
         return [
-            row_of(self.environment, own, self.groups.get((NOMINAL, observer), []), i)
+            row_of(self.environment, own, self.groups.get((NOMINAL, observer), []), i, runs=self.runs)
             for (_, observer), own in self.groups.items()
             for i in range(len(self.vehicles))
         ]

@@ -17,7 +17,17 @@ import numpy as np
 
 from coopenv.backends.base import Backend
 from coopenv.backends.mrclam_dataset import IN_SPACE
-from coopenv.backends.sources import SourceKind, is_bag, kind_of, open_backend, open_recording
+from coopenv.backends.sources import (
+    OBJECT,
+    WHOLE,
+    Selection,
+    SourceKind,
+    is_bag,
+    is_recording,
+    kind_of,
+    open_backend,
+    open_recording,
+)
 from coopenv.base.errors import CoopenvError, DataWarning, suggest
 from coopenv.bench.observers.changes import NO_FOLLOWERS, leaders_of
 from coopenv.bench.observers.faults import (
@@ -56,7 +66,9 @@ class RecordSource(ABC):
     usual: ClassVar[tuple[str, ...]] = (NOMINAL,)
     """Variants that are run by default."""
     seeded: ClassVar[bool] = False
-    """True if the record depends on the seed."""
+    """Whether another seed gives another record."""
+    recorded: ClassVar[bool] = True
+    """Whether all of its records are the same recording."""
     windowed: ClassVar[bool] = True
     """Judge windows of time from the start on by default; robots on a plane have none."""
 
@@ -129,6 +141,7 @@ class SimulatedRecords(RecordSource):
     actions: Mapping[int, np.ndarray] | None = field(default=None, compare=False)
     """Actions (decisions, rows, A) by seed, which driven vehicles take in place of the policy's."""
     seeded: ClassVar[bool] = True
+    recorded: ClassVar[bool] = False
 
     def world(self) -> Scenario:
         """Return the scenario."""
@@ -154,6 +167,7 @@ class Robots(RecordSource):
 
     data: Path | None
     """The folder with the data; None: the environment variable COOPENV_DATA."""
+    selection: Selection = WHOLE
     named: ClassVar[Mapping[str, str]] = ROBOT_VARIANTS
     usual: ClassVar[tuple[str, ...]] = tuple(ROBOT_VARIANTS)
     windowed: ClassVar[bool] = False
@@ -170,12 +184,12 @@ class Robots(RecordSource):
 
     def world(self) -> Recording:
         """Return the robots' record."""
-        return open_recording(self.name, self.data)
+        return open_recording(self.name, self.data, None, self.selection)
 
     def recording(self, variant: str, seed: int) -> Recording:
         """Return the robots' record in a variant."""
         with already_warned():
-            return open_recording(self.name, self.data, variant)
+            return open_recording(self.name, self.data, variant, self.selection)
 
 
 @dataclass(frozen=True)
@@ -183,19 +197,39 @@ class LogFile(RecordSource):
     """A record in a file, as it is and with faults."""
 
     path: Path
+    selection: Selection = WHOLE
 
     def world(self) -> Recording:
         """Return the file's record."""
-        return open_recording(self.path)
+        return self.selection.applied(self._whole(), self.name)
 
     def recording(self, variant: str, seed: int) -> Recording:
         """Return the file's record with a fault."""
-        recording = self.world()
+        return self.fault(variant).applied(self.selection.applied(self._whole(seed), self.name), seed)
+
+    def _whole(self, seed: int = 0) -> Recording:
+        """Return the file's record with the faults of its scenario."""
+        recording = open_recording(self.path)
         if recording.scenario is not None and any(faults.any for faults in recording.scenario.all_faults):
             # Messages are not recorded: the same are drawn again.
             again = record(open_backend(self.path, None, {}), seed)
             recording = replace(recording, interference=again.interference)
-        return self.fault(variant).applied(recording, seed)
+        return recording
+
+
+@dataclass(frozen=True)
+class GivenRecord(RecordSource):
+    """A `Recording`, as it is and with faults."""
+
+    given: Recording = field(repr=False)
+
+    def world(self) -> Recording:
+        """Return it."""
+        return self.given
+
+    def recording(self, variant: str, seed: int) -> Recording:
+        """Return it with a fault."""
+        return self.fault(variant).applied(self.given, seed)
 
 
 @dataclass(frozen=True)
@@ -205,6 +239,7 @@ class Bags(RecordSource):
     path: Path
     topics: Path | None
     overrides: Mapping[str, Any]
+    selection: Selection = WHOLE
     seeded: ClassVar[bool] = True
 
     def check(self) -> None:
@@ -225,10 +260,10 @@ class Bags(RecordSource):
 
     def _backend(self) -> Backend:
         times = [path.stat().st_mtime_ns for path in (self.path, self.topics) if path is not None and path.exists()]
-        key = pickle.dumps((self.path, self.topics, self.overrides, times))
+        key = pickle.dumps((self.path, self.topics, self.overrides, self.selection, times))
         if key not in _opened:
             _opened.clear()
-            _opened[key] = open_backend(self.path, None, self.overrides, topics=self.topics)
+            _opened[key] = open_backend(self.path, None, self.overrides, topics=self.topics, selection=self.selection)
         return _opened[key]
 
 
@@ -246,14 +281,15 @@ ALL = "all"  # asks for every variant that the source can have
 
 
 def find_source(
-    text: ScenarioLike,
+    text: ScenarioLike | Recording,
     overrides: Mapping[str, Any] | None = None,
     data: str | Path | None = None,
     topics: str | Path | None = None,
     faults: Sequence[str] = (),
     policy: str | None = None,
+    selection: Selection = WHOLE,
 ) -> RecordSource:
-    """Return the source of an environment as for `load_scenario`, a sub-dataset's name, a log file or a ROS bag.
+    """Return the source of an environment as for `load_scenario`, of recorded data by name, or of a `Recording`.
 
     Args:
         text: which one.
@@ -262,14 +298,23 @@ def find_source(
         topics: map of a ROS bag's topics.
         faults: variants with parameters, see `coopenv.bench.observers.faults`.
         policy: of the driven vehicles of a simulated environment; None: action zero.
+        selection: the part of recorded data that is used.
 
     Raises:
         CoopenvError: there is none of that name, or an option for what is no such source.
     """
     given = [faults] if isinstance(faults, str) else faults
-    sort, added = kind_of(text), tuple(variant_of(fault) for fault in dict.fromkeys(given))
+    added = tuple(variant_of(fault) for fault in dict.fromkeys(given))
+    if is_recording(text):
+        options = {"overrides": overrides, "data": data, "topics": topics, "policy": policy}
+        for option in [option for option, value in options.items() if value]:
+            raise CoopenvError(f"{option}: is for names of environments or files, a Recording was given")
+        return GivenRecord(OBJECT, selection.applied(text, OBJECT), added=added)
+    sort = kind_of(text)
     bag = is_bag(text, topics)
     if sort is SourceKind.ENVIRONMENT and not bag and topics is None and data is None:
+        for option, value in selection.given.items():
+            raise CoopenvError(f"--{option} {value}: is for recorded data, {scenario_name(text)} is simulated")
         scenario = load_scenario(text, overrides)
         worlds = tuple(with_world(made, scenario) for made in added)
         if policy is not None:
@@ -295,8 +340,8 @@ def find_source(
         if holds:
             raise CoopenvError(reason)
     if bag:
-        return Bags(path.stem, path, topic_map, dict(overrides or {}), added=added)
-    return Robots(str(text), folder) if robots else LogFile(path.stem, path, added=added)
+        return Bags(path.stem, path, topic_map, dict(overrides or {}), selection, added=added)
+    return Robots(str(text), folder, selection) if robots else LogFile(path.stem, path, selection, added=added)
 
 
 def variants_of(source: RecordSource, asked: str | Iterable[str] | None) -> tuple[str, ...]:

@@ -115,7 +115,7 @@ def everything(board: Leaderboard, width: int = WIDTH) -> Iterator[Table | str]:
         yield f"\n{board.title}, {variant}"
         yield error_table(board, variant)
         if len(board.seeds) > 1:
-            yield "0.0123(4): 0.0123 with a standard error of 0.0004 over the seeds."
+            yield f"0.0123(4): 0.0123 with a standard error of 0.0004 over the {board.sampled}."
         if board.bounds_in(variant):
             yield ""
             yield ratio_table(board, variant)

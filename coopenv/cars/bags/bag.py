@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
-from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning, printable
+from coopenv.backends.worlds import without_robots
+from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning, check_one_of, printable
 from coopenv.cars.backend.assembler import BROADCAST, Assembler
 from coopenv.cars.backend.binding import OPTIONS, bind, marker_places, reset_options
 from coopenv.cars.bags.clocks import checked
@@ -40,8 +41,20 @@ OFF = 0.1
 """Share by which the rate of a camera may differ from the environment's without a warning."""
 
 
+ENDLESS = {
+    "termination.arrival": False,
+    "termination.collision": False,
+    "termination.off_route": None,
+    "termination.after_arrival": "park",
+}
+"""What was driven goes on beyond goals and contacts of the environment, and so do its errors."""
+
+
 class Bag(TickGenerator):
     """Bags as a backend. Ticks are the same in every episode; actions change nothing.
+
+    An episode lasts as long as the bag: goals, routes and contacts end it where overrides set `termination` so. A car
+    whose odometry is silent continues with its last twist, and its frames count.
 
     Tick 0 is one and a half camera periods after everything that is needed has begun to come, so that in what follows
     a tick is half a period behind the frames of the camera that began last. Initial estimates and radio are those of
@@ -55,6 +68,9 @@ class Bag(TickGenerator):
         paths: Sequence[str | Path],
         topics: str | Path | TopicMap,
         overrides: Mapping[str, Any] | None = None,
+        start: float = 0.0,
+        until: float | None = None,
+        robots: Sequence[str] | None = None,
     ) -> None:
         """Read bags.
 
@@ -62,6 +78,9 @@ class Bag(TickGenerator):
             paths: of one recording; files or folders of ROS 1 or 2, for example one per car.
             topics: the map, see docs/bags.md.
             overrides: dotted keys of its environment, for example another observer's name; `horizon` shortens it.
+            start: time of tick 0 after that of the whole bag, s.
+            until: time of the last tick after that, s; None: as long as there is data.
+            robots: cars that are used, by their names or those of their vehicles; None: all.
 
         Raises:
             TopicMapError: the map is not valid.
@@ -70,30 +89,48 @@ class Bag(TickGenerator):
         """
         check_extra()
         self.map = topics if isinstance(topics, TopicMap) else load_map(topics)
-        self.changes = changes = {**self.map.overrides, **(overrides or {})}
+        self.changes = changes = {**ENDLESS, **self.map.overrides, **(overrides or {})}
         self.where = ", ".join(str(path) for path in paths)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ScenarioWarning)  # repeated below
             scenario = load_scenario(self.map.environment_path, changes)
         self._rate = float(scenario.rates.camera)
         self.binding = bind(scenario, self.map.cars, self.map.markers, self.map.path.name, None, self.map.make)
-        self.log = read_log([Path(path) for path in paths], self.map, self.binding)
-        self._begin, ticks = self._ticks()
-        scenario = self._scenario(changes, ticks)
+        self.kept = self._kept(robots)
+        read = [car for car in self.map.cars if self.binding.cars.get(car.name, self.kept[0]) in self.kept]
+        self.log = read_log([Path(path) for path in paths], self.map.model_copy(update={"cars": read}), self.binding)
+        self._begin, ticks = self._ticks(start, until)
+        scenario = without_robots(self._scenario(changes, ticks), self.kept)
         self.binding = replace(self.binding, scenario=scenario)
         known = any(sample.role is Role.TRUTH for sample in self.log.samples)
-        super().__init__(scenario, Capabilities(known, False, False, ticks, batched=False, recorded=True))
+        here = self.kept if robots is not None else None
+        super().__init__(scenario, Capabilities(known, False, False, ticks, False, True, here))
         for note in (*self.log.notes, *self._odd_rates(), *self._far_truth()):
             warnings.warn(f"{self.where}: {note}", DataWarning, stacklevel=2)
 
-    def _ticks(self) -> tuple[int, int]:
-        """Return when tick 0 is, ns, and how many ticks there are."""
+    def _kept(self, robots: Sequence[str] | None) -> tuple[int, ...]:
+        """Return the vehicles of some cars; None: of all."""
+        numbers = {**self.binding.cars} | {
+            self.binding.scenario.vehicle_names[i]: i for i in self.binding.cars.values()
+        }
+        for name in robots or ():
+            check_one_of(f"{self.where}: robots: unknown robot", name, numbers, DataError)
+        return tuple(sorted({numbers[name] for name in (self.binding.cars if robots is None else robots)}))
+
+    def _ticks(self, start: float, until: float | None) -> tuple[int, int]:
+        """Return when tick 0 is, ns, and how many ticks there are, of a part from and to times in s."""
         needed = [s for s in self.log.samples if s.car in self.binding.cars and s.role not in UNNEEDED]
         first = {(s.car, s.role): s.stamp for s in reversed(needed)}
         begin = max(first.values()) + round(self.map.start * NS) + round(1.5 * NS / self._rate)
         end = needed[-1].stamp
         if self.map.duration is not None:
             end = min(end, begin + round(self.map.duration * NS))
+        for option, time in (("from", start), ("until", until or 0.0)):
+            if time * NS > max(0, end - begin):
+                length = max(0.0, (end - begin) / NS)
+                raise DataError(f"{self.where}: {option}: {time:g} s; {length:.4g} s are recorded")
+        end = end if until is None else begin + round(until * NS)
+        begin += round(start * NS)
         stamps = np.array([begin, *(s.stamp for s in needed if begin < s.stamp < end), end])
         gaps = np.diff(stamps)
         if gaps.max() > LONGEST_GAP * NS:
@@ -143,7 +180,9 @@ class Bag(TickGenerator):
             while following < len(samples) and _used(samples[following]) <= now:
                 assembler.put(samples[following])
                 following += 1
-            yield assembler.begin(now) if k == 0 else assembler.tick(k, now)
+            tick = assembler.begin(now) if k == 0 else assembler.tick(k, now)
+            missing = np.zeros(len(tick.visible), bool) if tick.missing is None else tick.missing
+            yield replace(tick, missing=missing & ~tick.visible.any(axis=1))
 
 
 def _used(sample: Sample) -> int:

@@ -304,6 +304,8 @@ def leads_of(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Bindi
     start = samples[0].stamp if samples else 0
     for car, vehicle in binding.cars.items():
         topics = {entry.role: entry.topic for entry in chosen if entry.car == car}
+        if not topics:  # a car that is left out
+            continue
         own = {role: [sample for sample in samples if (sample.car, sample.role) == (car, role)] for role in topics}
         moved = {role: _cumulated(tracks_of(own[role], start)) for role in topics if role in ODOMETRY}
         truth = _path(tracks_of(own[Role.TRUTH], start)) if Role.TRUTH in topics else None

@@ -318,7 +318,7 @@ def test_observers_are_compared_where_they_are_meant_to_be() -> None:
 def test_recorded_robots_have_rows_without_a_bound(tmp_path: Path, name: str) -> None:
     mrclam_files.write(tmp_path, seconds=15.0)
     source = find_source(name, data=tmp_path)
-    rows = compare(["dead_reckoning", "mekf"], name, 4, data=tmp_path, variants=["landmarks", "blind"]).rows
+    rows = compare(["dead_reckoning", "mekf"], name, data=tmp_path, variants=["landmarks", "blind"]).rows
     assert len(rows) == 2 * 2 * 5 and all(np.isnan(row.bound_m) and not row.failure for row in rows)
     assert all(np.isfinite([row.position_rmse_m, row.orientation_rmse_deg, row.ate_m]).all() for row in rows)
     # One record, judged from the start on: nothing was averaged over seeds, and nothing left out but the start itself.

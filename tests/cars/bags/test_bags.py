@@ -30,6 +30,7 @@ from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.helpers import bags
 
+SAMPLES = Path(__file__).resolve().parents[3] / "examples" / "bags"
 pytest.importorskip("rosbags", reason="needs the extra 'log'")
 
 
@@ -147,6 +148,58 @@ def test_a_comparison_reads_a_bag_once_and_again_after_a_change(folder: Path, mo
     assert len(opened) == 1
     given.write_text(f"duration = 1.0\n{bags.MAP}", encoding="utf-8")
     assert source.recording("nominal", 3).ticks < expected.ticks and len(opened) == 2
+
+
+def test_a_part_of_a_bag_begins_later(folder: Path, reference: list[Sensed]) -> None:
+    bag = Bag([folder / "ros1.bag"], folder / "topics.toml", start=1.0, until=2.0)
+    ticks, rate = ticks_of(bag), bag.scenario.rates.camera
+    assert len(ticks) == rate + 1
+    first = reference[round(rate)]
+    assert ticks[0].truth is not None and first.truth is not None
+    assert_allclose(ticks[0].truth.position, first.truth.position, atol=1e-9)
+    assert_allclose(ticks[-1].bearings, reference[round(2 * rate)].bearings, atol=1e-9)
+    for options, line in (
+        ({"start": 9.0}, r"from: 9 s; 3\.975 s are recorded"),
+        ({"until": 9.0}, r"until: 9 s; 3\.975 s are"),
+        ({"robots": ["svea9"]}, "robots: unknown robot 'svea9'.* known: svea3, vehicle_1"),
+    ):
+        with pytest.raises(DataError, match=rf"ros1\.bag: {line}"):
+            Bag([folder / "ros1.bag"], folder / "topics.toml", None, **options)
+
+
+@pytest.mark.filterwarnings("ignore::coopenv.base.errors.DataWarning")
+def test_a_car_that_is_left_out_needs_no_topics(tmp_path: Path) -> None:
+    given = tmp_path / "topics.toml"
+    text = (SAMPLES / "topics.toml").read_text(encoding="utf-8")
+    given.write_text(text.replace('"svea1"', '"absent"'), encoding="utf-8")
+    with pytest.raises(DataError, match="absent has no odometry"):
+        Bag([SAMPLES / "mcap"], given)
+    bag = Bag([SAMPLES / "mcap"], given, {"horizon": 1.0}, robots=["svea7"])
+    recording = record(bag)
+    assert bag.capabilities.estimated == (0,) and recording.left_out.tolist() == [False, True]
+    assert recording.visible[:, 0].any() and not run("robust", recording).failure
+
+
+def test_goals_and_contacts_of_the_environment_do_not_end_a_bag(folder: Path) -> None:
+    ends = """
+"vehicles.0.goal" = { position = [0.0, 0.0, 0.0], radius = 50.0 }
+"horizon" = 1.0
+"""
+    given = folder / "goal.toml"
+    given.write_text(bags.MAP.replace("[overrides]", f"[overrides]{ends}"), encoding="utf-8")
+    whole = coopenv.run(folder / "ros1.bag", topics=given)
+    assert np.isnan(whole.metrics["vehicles"][0]["ended_at_s"]) and whole.trajectory.t[-1] == pytest.approx(1.0)
+    ended = coopenv.run(folder / "ros1.bag", topics=given, overrides={"termination.arrival": True})
+    assert ended.metrics["vehicles"][0]["ended_at_s"] < 0.5
+
+
+def test_frames_count_while_odometry_is_silent(folder: Path, tmp_path: Path) -> None:
+    kept = [m for m in bags.sent() if "twist" not in m.topic or not 1.0e9 < m.stamp < 2.5e9]
+    bag = Bag([bags.write(tmp_path / "ros1", kept, "ros1")], folder / "topics.toml")
+    recording = record(bag)
+    silent = slice(round(1.6 / recording.dt), round(2.4 / recording.dt))
+    assert recording.visible[silent, 0].any(axis=-1).mean() > 0.9
+    assert np.linalg.norm(recording.translation[silent, 0], axis=-1).min() > 0.0, "it continues with its last twist"
 
 
 def test_the_python_interface_takes_a_bag(folder: Path) -> None:
