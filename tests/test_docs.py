@@ -141,7 +141,15 @@ def test_the_page_on_recorded_robots(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "recordings").mkdir()
     mrclam_files.write(tmp_path / "recordings", 6, seconds=15.0)
-    run(DOCS / "data.md")
+    t = np.arange(100) * 0.05
+    yaw = 0.1 * t
+    x, y = 3.0 * np.sin(yaw), 3.0 * (1.0 - np.cos(yaw))
+    angle = np.arctan2(3.0 - y, 3.0 - x) - yaw
+    rows = [f"{a},{b},{c},{d},0.3,0.1,,{e}" for a, b, c, d, e in zip(t, x, y, yaw, angle, strict=True)]
+    (tmp_path / "robot.csv").write_text("\n".join(["t,x,y,yaw,v,omega,azimuth_1,azimuth_2", *rows]))
+    *_, own = run(DOCS / "data.md")
+    rmse = coopenv.compare(["mekf"], own["recording"]).rows[0].position_rmse_m
+    assert own["recording"].visible[:, 0].sum(axis=0).tolist() == [0, 100, 0] and rmse < 0.05
     errors = np.array([float(number) for number in re.findall(r"\d\.\d+", capsys.readouterr().out)])
     assert errors.shape == (5,) and (errors < 0.5).all()
 

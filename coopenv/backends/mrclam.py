@@ -20,7 +20,7 @@ from coopenv.base.errors import DataError, suggest
 from coopenv.estimation.poses import Array, about_z
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.planar_model import ARC, CALIBRATING, IROBOT_CREATE, PATH, SLOWING, TURN, TURNING, CommandHistory
-from coopenv.observers.recording import Recording, Truth, check_recording
+from coopenv.observers.recording import Recording, Truth, check_recording, received_by_all
 
 __all__ = ["VARIANTS", "Dataset", "Variant", "load_dataset", "recording_of"]
 
@@ -112,7 +112,7 @@ def recording_of(dataset: Dataset, variant: Variant, in_space: bool = False) -> 
         setups=_setups(sorted(dataset.landmarks), in_space),
         order=tuple(range(N)),
         dt=TICK_S,
-        inbox_tick=_inbox(K, N),
+        inbox_tick=received_by_all(K, N, MESSAGE_PERIOD_TICKS),
         period=MESSAGE_PERIOD_TICKS,
         staleness=math.inf,
         due=np.ones(K, bool),
@@ -159,16 +159,6 @@ def _response(turn: Array, step: Array) -> tuple[Array, Array]:
         made[k] = history.response(TICK_S, lead + TRAPEZOID_S)[0]
     turned = turn_scale * (made[:, TURN] - turn_offset * made[:, TURNING])
     return turned, speed_scale * made[:, PATH] + speed_offset * made[:, ARC] - slowdown * made[:, SLOWING]
-
-
-def _inbox(ticks: int, vehicles: int) -> NDArray[np.int64]:
-    """Return (K, N, N) the tick of the last received message: sent one tick ago or more."""
-    before = np.maximum(np.arange(ticks) - 1, 0)
-    last = before - before % MESSAGE_PERIOD_TICKS
-    inbox = np.repeat(last, vehicles * vehicles).reshape(ticks, vehicles, vehicles)
-    inbox[0] = -1
-    inbox[:, np.arange(vehicles), np.arange(vehicles)] = -1
-    return inbox
 
 
 def counted(robot: Robot, variant: Variant) -> NDArray[np.bool_]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from itertools import chain
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,8 +23,10 @@ from coopenv.estimation.poses import (
     are_rotations,
     are_unit_vectors,
     everywhere,
+    exp_so3,
+    exp_translation,
 )
-from coopenv.observers.contract import ObserverInit, Received, Setup, Tick, sealed
+from coopenv.observers.contract import Gains, ObserverInit, Received, SensorNoise, Setup, Tick, sealed
 from coopenv.scenario.learning import MOST, PARAMETERS
 from coopenv.scenario.schema import neighbour_sets, processing_order
 
@@ -148,6 +150,97 @@ class Recording(Measurements):
                     object.__setattr__(self, name, values := values.astype(np.float64))
                 values.setflags(write=False)
 
+    @classmethod
+    def from_arrays(
+        cls,
+        *,
+        dt: float,
+        landmarks: ArrayLike,
+        velocity: ArrayLike,
+        angular_velocity: ArrayLike,
+        bearings: ArrayLike,
+        noise: SensorNoise,
+        start_position: ArrayLike | None = None,
+        start_rotation: ArrayLike | None = None,
+        start_std: tuple[float, float] = (0.01, 0.01),
+        truth_position: ArrayLike | None = None,
+        truth_rotation: ArrayLike | None = None,
+        period: int = 1,
+    ) -> Self:
+        """Return a recording of vehicle_1, vehicle_2, ... that receive each other's messages one tick later.
+
+        Args:
+            dt: time between two ticks, s.
+            landmarks: (L, 3) m, map; they are landmark_1, landmark_2, ...
+            velocity: (K, N, 3) m/s, body frame (x forward), held from the tick before to each tick; row 0 is unused.
+            angular_velocity: (K, N, 3) rad/s, likewise.
+            bearings: (K, N, L + N, 3) unit vectors from the camera to landmarks, then vehicles, body frame; NaN where
+                nothing was measured.
+            noise: standard deviations of odometry and bearings.
+            start_position: (N, 3) m, map, initial estimate; None: the first true one.
+            start_rotation: (N, 3, 3) body to map, likewise.
+            start_std: of the initial estimates per axis, rad and m.
+            truth_position: (K, N, 3) m, map, NaN where not known; None: nowhere.
+            truth_rotation: (K, N, 3, 3) body to map, likewise.
+            period: ticks between messages.
+
+        Raises:
+            DataError: an array has another shape or holds what it must not; one line that names it.
+        """
+        given = {name: values for name, values in locals().items() if name in _SHAPES and values is not None}
+        arrays = {name: _numbers(name, values) for name, values in given.items()}
+        for name, rank in (("velocity", 3), ("landmarks", 2)):
+            _require(arrays[name].ndim == rank, f"{name}: expected {_SHAPES[name]}, got shape {arrays[name].shape}")
+        (K, N, _), L = arrays["velocity"].shape, len(arrays["landmarks"])
+        T = L + N
+        _require(K > 1 and N > 0, f"velocity: expected {_SHAPES['velocity']}, K > 1, got shape {(K, N, 3)}")
+        _between("dt", dt, *TICK_LENGTHS_S)
+        _between("period", period, 1, MAX_PERIOD_TICKS)
+        unknown = {"truth_position": np.full((K, N, 3), np.nan), "truth_rotation": np.full((K, N, 3, 3), np.nan)}
+        arrays = unknown | arrays
+        for part in ("position", "rotation"):
+            arrays.setdefault(f"start_{part}", arrays[f"truth_{part}"][0])
+        for name, array in arrays.items():
+            shape = tuple({"K": K, "N": N, "L": L, "T": T}.get(axis) or int(axis) for axis in _SHAPES[name].split())
+            _require(array.shape == shape, f"{name}: expected {_SHAPES[name]} = {shape}, got {array.shape}")
+        for name in ("landmarks", "velocity", "angular_velocity"):
+            _require(
+                np.isfinite(arrays[name]).all(),
+                f"{name}: not finite at {np.argwhere(~np.isfinite(arrays[name]))[:1].tolist()}",
+            )
+        for part in ("position", "rotation"):
+            known = np.isfinite(arrays[f"start_{part}"]).all()
+            _require(known, f"start_{part}: needed, as the first true one is not known")
+        turn, step = arrays["angular_velocity"] * dt, arrays["velocity"] * dt
+        turn[0], step[0] = 0.0, 0.0
+        names = (*(f"landmark_{n + 1}" for n in range(L)), *(f"vehicle_{n + 1}" for n in range(N)))
+        gains = Gains(1.0, np.full(T, 10.0), (0.1, 1.0), (start_std[0] ** 2, start_std[1] ** 2), 0.1)
+        targets, here = np.arange(T), np.zeros(3)
+        recording = cls(
+            setups=tuple(
+                Setup(i, names[L + i], names, L, np.delete(targets, L + i), here, here, noise, gains) for i in range(N)
+            ),
+            order=tuple(range(N)),
+            dt=dt,
+            rotation=np.array([[exp_so3(w) for w in row] for row in turn]),
+            translation=np.array([[*map(exp_translation, *row)] for row in zip(turn, step, strict=True)]),
+            velocity=arrays["velocity"],
+            angular_velocity=arrays["angular_velocity"],
+            bearings=arrays["bearings"],
+            visible=np.asarray(np.isfinite(arrays["bearings"]).all(axis=-1)),
+            landmarks=np.broadcast_to(arrays["landmarks"], (K, L, 3)),
+            inbox_tick=received_by_all(K, N, period),
+            period=period,
+            staleness=math.inf,
+            due=np.ones(K, bool),
+            start_rotation=arrays["start_rotation"],
+            start_position=arrays["start_position"],
+            start_covariance=np.tile(np.diag(np.repeat(np.square(start_std), 3)), (N, 1, 1)),
+            truth=Truth(arrays["truth_rotation"], arrays["truth_position"]),
+        )
+        check_recording(recording, "recording")
+        return recording
+
     @property
     def ticks(self) -> int:
         """K, the start included."""
@@ -212,6 +305,36 @@ class Recording(Measurements):
     def tick(self, k: int, vehicle: int, messages: Mapping[int, Received]) -> Tick:
         """Return the measurements of one vehicle at tick k, with its messages."""
         return self.at(k).tick(self.setups[vehicle], messages)
+
+
+_SHAPES = {
+    "landmarks": "L 3",
+    "velocity": "K N 3",
+    "angular_velocity": "K N 3",
+    "bearings": "K N T 3",
+    "start_position": "N 3",
+    "start_rotation": "N 3 3",
+    "truth_position": "K N 3",
+    "truth_rotation": "K N 3 3",
+}
+"""Of the arrays that `Recording.from_arrays` takes; T = L + N."""
+
+
+def _numbers(name: str, values: ArrayLike) -> Array:
+    """Return a copy of an array. Raises DataError: it does not hold numbers."""
+    try:
+        return np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{name}: not an array of numbers ({error})") from None
+
+
+def received_by_all(ticks: int, vehicles: int, period: int) -> NDArray[np.int64]:
+    """Return (K, N, N) the tick of the last received message: sent one tick ago or more."""
+    before = np.maximum(np.arange(ticks) - 1, 0)
+    inbox = np.repeat(before - before % period, vehicles * vehicles).reshape(ticks, vehicles, vehicles)
+    inbox[0] = -1
+    inbox[:, np.arange(vehicles), np.arange(vehicles)] = -1
+    return inbox
 
 
 def is_due(index: ArrayLike, ratio: float) -> NDArray[np.bool_]:

@@ -144,3 +144,53 @@ def test_simulations_have_no_parts() -> None:
 def test_seeds_of_one_recording_are_mentioned(whole: Recording) -> None:
     with pytest.warns(DataWarning, match="recording: one recording, in which seeds draw nothing"):
         compare(["riccati"], part(whole, until=1.0), 3)
+
+
+def arrays_of(recording: Recording) -> dict[str, Any]:
+    """Return the arguments of `Recording.from_arrays` that give a recording of standing landmarks again."""
+    names = ("velocity", "angular_velocity", "bearings", "start_position", "start_rotation", "dt", "period")
+    truth = {"truth_position": recording.truth.position, "truth_rotation": recording.truth.rotation}
+    given = {name: getattr(recording, name) for name in names}
+    return {**given, **truth, "landmarks": recording.landmarks[0], "noise": recording.setups[0].noise}
+
+
+def test_a_recording_is_made_of_arrays(whole: Recording) -> None:
+    made = Recording.from_arrays(**arrays_of(whole))
+    assert [setup.name for setup in made.setups] == [setup.name for setup in whole.setups]
+    for name in ("rotation", "translation", "visible", "inbox_tick", "start_covariance"):
+        assert_allclose(getattr(made, name), getattr(whole, name), atol=1e-3, err_msg=name)
+    rows = coopenv.compare(["mekf"], made).rows
+    assert len(rows) == 5 and all(row.position_rmse_m < 0.05 and not row.failure for row in rows)
+    short = {name: np.asarray(values)[:3] for name, values in arrays_of(whole).items() if "truth" in name}
+    first = {"start_position": None, "start_rotation": None}
+    assert_array_equal(Recording.from_arrays(**(arrays_of(whole) | first)).start_position, short["truth_position"][0])
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"velocity": np.zeros((4, 3))}, r"velocity: expected K N 3, got shape \(4, 3\)"),
+        ({"velocity": np.zeros((1, 5, 3))}, "velocity: expected K N 3, K > 1"),
+        (
+            {"angular_velocity": np.zeros((9, 5, 3))},
+            r"angular_velocity: expected K N 3 = \(228, 5, 3\), got \(9, 5, 3\)",
+        ),
+        ({"bearings": np.full((228, 5, 10, 3), 0.7)}, "recording: bearings of vehicle_1, tick 0: not unit vectors"),
+        ({"velocity": np.full((228, 5, 3), np.nan)}, r"velocity: not finite at \[\[0, 0, 0\]\]"),
+        ({"landmarks": [["a", 1, 2]]}, "landmarks: not an array of numbers"),
+        ({"dt": 0.0}, "dt: 0.0 is not in 1e-05"),
+        ({"period": 0}, "period: 0 is not in 1"),
+        (
+            {"start_position": None, "truth_position": None},
+            "start_position: needed, as the first true one is not known",
+        ),
+        (
+            {"truth_rotation": np.full((228, 5, 3, 3), 57.3)},
+            "recording: truth.rotation of vehicle_1, tick 0: not a rot",
+        ),
+        ({"start_std": (0.0, 0.0)}, "recording: .*(start_covariance|P0)"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_one_line(whole: Recording, change: dict[str, Any], line: str) -> None:
+    with pytest.raises(DataError, match=line):
+        Recording.from_arrays(**(arrays_of(whole) | change))
