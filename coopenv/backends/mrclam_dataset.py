@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.base.errors import DataError, DataWarning, suggest
-from coopenv.estimation.poses import Array
+from coopenv.estimation.poses import MISFIT_DEG, Array, about_z, bearing_misfit_deg
 
 NAMES = tuple(f"mrclam_{number}" for number in range(1, 10))
 IN_SPACE = "_space"
@@ -250,10 +250,27 @@ def _remarks_on(dataset: Dataset, tables: list[Rows]) -> list[str]:
     if outside:
         time = f"0 to {dataset.duration_s:.0f} s, in which there is odometry"
         remarks.append(f"{outside} of {total} detections left out: not within {time}")
+    found = {int(subject) for robot in dataset.robots for subject in robot.detections[:, 1]}
+    if unseen := [str(subject) for subject in dataset.landmarks if subject not in found]:
+        remarks.append(f"landmarks that were never detected: {', '.join(unseen)}")
+    for robot in dataset.robots:
+        if (misfit := _misfit(dataset, robot)) > MISFIT_DEG:
+            off = f"bearings to landmarks are {misfit:.0f} deg off (median)"
+            remarks.append(f"Robot{robot.subject}_Groundtruth.dat: {off}: are columns 2 and 3 in m and 4 in rad?")
     for what, count in (("rows that stood too late put in order", "late"), ("rows with NaN left out", "unknown")):
         counts = [f"{number} of {table.path.name}" for table in tables if (number := getattr(table, count))]
         remarks += [f"{what}: {', '.join(counts)}"] if counts else []
     return remarks
+
+
+def _misfit(dataset: Dataset, robot: Robot) -> float:
+    """Return by how much a robot's bearings to landmarks differ from its true poses, deg; NaN: not known."""
+    seen = robot.detections[np.isin(robot.detections[:, 1], list(dataset.landmarks))]
+    position, heading, _, known = robot.truth.at(seen[:, 0])
+    places = np.array([dataset.landmarks[int(subject)] for subject in seen[:, 1]]).reshape(-1, 2)
+    flat = [np.column_stack([values, np.zeros(len(seen))])[known] for values in (position, places)]
+    rays = np.column_stack([np.cos(seen[:, 3]), np.sin(seen[:, 3]), np.zeros(len(seen))])[known]
+    return bearing_misfit_deg(about_z(heading[known]), flat[0], rays, flat[1])
 
 
 def _barcodes(table: Rows) -> dict[int, int]:

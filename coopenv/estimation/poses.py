@@ -142,6 +142,25 @@ def about_z(angle: Array) -> Array:
     return np.stack(rows, axis=-2)
 
 
+MISFIT_DEG = 30.0
+"""Median angle between bearings and true poses above which these have another unit or frame."""
+
+
+def bearing_misfit_deg(rotation: Array, position: Array, bearings: Array, targets: Array) -> float:
+    """Return the median angle between measured bearings and those by true poses, deg; NaN without any.
+
+    Args:
+        rotation: (M, 3, 3) body to map.
+        position: (M, 3) m, map.
+        bearings: (M, 3) unit vectors in the body frame.
+        targets: (M, 3) m, map.
+    """
+    away = targets - position
+    along = np.einsum("mij,mi,mj->m", rotation, away, bearings) / np.maximum(lengths(away), 1e-9)
+    known = along[np.isfinite(along)]
+    return float(np.degrees(np.median(np.arccos(np.clip(known, -1.0, 1.0))))) if len(known) else float("nan")
+
+
 def error_rotation(rotation: np.ndarray, rotation_estimate: np.ndarray) -> np.ndarray:
     """Return Rtilde = Rhat^T R of rotations (..., 3, 3) that map body to map frame."""
     return np.asarray(np.swapaxes(np.asarray(rotation_estimate, float), -1, -2) @ np.asarray(rotation, float))

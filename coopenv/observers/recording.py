@@ -2,6 +2,7 @@
 
 import math
 import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from itertools import chain
@@ -11,9 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coopenv.base.errors import CoopenvError, DataError, shown
+from coopenv.base.errors import CoopenvError, DataError, DataWarning, shown
 from coopenv.base.sections import LARGEST
 from coopenv.estimation.poses import (
+    MISFIT_DEG,
     Array,
     Fields,
     Mask,
@@ -22,6 +24,7 @@ from coopenv.estimation.poses import (
     are_numbers,
     are_rotations,
     are_unit_vectors,
+    bearing_misfit_deg,
     everywhere,
     exp_so3,
     exp_translation,
@@ -239,6 +242,14 @@ class Recording(Measurements):
             truth=Truth(arrays["truth_rotation"], arrays["truth_position"]),
         )
         check_recording(recording, "recording")
+        for i in range(N):
+            k, n = np.nonzero(recording.visible[:, i, :L])
+            pose = recording.truth.rotation[k, i], recording.truth.position[k, i]
+            misfit = bearing_misfit_deg(*pose, recording.bearings[k, i, n], recording.landmarks[k, n])
+            if misfit > MISFIT_DEG:
+                why = "are truth_position in m and truth_rotation body to map?"
+                text = f"truth of vehicle_{i + 1}: bearings to landmarks are {misfit:.0f} deg off (median): {why}"
+                warnings.warn(DataWarning(text), stacklevel=2)
         return recording
 
     @property

@@ -252,8 +252,8 @@ def test_a_command_is_not_held_for_ever(dataset):
     assert v.tolist() == [0.0, 0.2, 0.0, 0.1, 0.0]
 
 
-def test_what_is_of_no_use_is_reported(tmp_path):
-    folder = write(tmp_path, seconds=6.0)
+def test_what_is_of_no_use_is_told(tmp_path):
+    folder = write(tmp_path, seconds=40.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         load_dataset("mrclam_6", folder)
@@ -271,13 +271,24 @@ def test_what_is_of_no_use_is_reported(tmp_path):
     assert [str(w.message) for w in caught] == [f"mrclam_6: no detections of robot 5; {said}"]
 
 
-def test_detections_beyond_the_odometry_are_left_out_and_reported(tmp_path):
+def test_truth_in_degrees_or_mm_and_unseen_landmarks_are_noticed(tmp_path):
+    folder = write(tmp_path, seconds=6.0)
+    path = folder / "Robot2_Groundtruth.dat"
+    table = np.loadtxt(path)
+    for factors in ((1.0, 1.0, 1.0, 57.29578), (1.0, 1000.0, 1000.0, 1.0)):
+        np.savetxt(path, table * np.array(factors), fmt="%.6f")
+        line = r"never detected: 9; Robot2_Groundtruth\.dat: bearings to landmarks are \d+ deg off .* 4 in rad\?$"
+        with pytest.warns(DataWarning, match=line):
+            load_dataset("mrclam_6", folder)
+
+
+def test_detections_beyond_the_odometry_are_left_out_and_told(tmp_path):
     folder = write(tmp_path, seconds=6.0)
     path = folder / "Robot2_Measurement.dat"
     table, others = np.loadtxt(path), [len(robot.detections) for robot in load_dataset("mrclam_6", folder).robots]
     for late in (-3.0, 3600.0):
         np.savetxt(path, table + np.array([late, 0.0, 0.0, 0.0]), fmt="%.6f")
-        with pytest.warns(DataWarning, match=r"left out: not within 0 to \d s, in which there is odometry$"):
+        with pytest.warns(DataWarning, match=r"left out: not within 0 to \d s, in which there is odometry"):
             robot = load_dataset("mrclam_6", folder).robots[1]
         assert robot.outside > 0 and robot.outside + len(robot.detections) == others[1]
         assert ((robot.detections[:, 0] >= 0.0) & (robot.detections[:, 0] <= 6.1)).all()

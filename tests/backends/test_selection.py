@@ -194,3 +194,10 @@ def test_a_recording_is_made_of_arrays(whole: Recording) -> None:
 def test_arrays_that_do_not_fit_are_one_line(whole: Recording, change: dict[str, Any], line: str) -> None:
     with pytest.raises(DataError, match=line):
         Recording.from_arrays(**(arrays_of(whole) | change))
+
+
+def test_arrays_with_a_truth_in_another_frame_are_noticed(whole: Recording) -> None:
+    given = arrays_of(whole)
+    turned = given["truth_rotation"] @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    with pytest.warns(DataWarning, match=r"truth of vehicle_1: bearings to landmarks are 90 deg off \(median\)"):
+        Recording.from_arrays(**(given | {"truth_rotation": turned}))

@@ -16,10 +16,10 @@ import numpy as np
 
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
 from coopenv.backends.worlds import without_robots
-from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning, check_one_of, printable
+from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning, check_one_of, listed, printable
 from coopenv.cars.backend.assembler import BROADCAST, Assembler
 from coopenv.cars.backend.binding import OPTIONS, bind, marker_places, reset_options
-from coopenv.cars.bags.clocks import checked
+from coopenv.cars.bags.clocks import checked, misfit_of_truth
 from coopenv.cars.bags.files import BagFile, check_extra
 from coopenv.cars.bags.log import NS, TopicRow, read_log, regularity
 from coopenv.cars.bags.topic_map import READ, UNNEEDED, TopicMap, load_map
@@ -27,6 +27,7 @@ from coopenv.cars.profile import IMAGES, SVEA, VELOCITY, Role
 from coopenv.cars.readings import POSES, READERS, CarPose, Sample, read
 from coopenv.cars.sensor_settings import TOPIC
 from coopenv.cars.vision import Calibration
+from coopenv.estimation.poses import MISFIT_DEG
 from coopenv.scenario import Scenario, load_scenario
 
 AHEAD = 100_000_000
@@ -105,7 +106,7 @@ class Bag(TickGenerator):
         known = any(sample.role is Role.TRUTH for sample in self.log.samples)
         here = self.kept if robots is not None else None
         super().__init__(scenario, Capabilities(known, False, False, ticks, False, True, here))
-        for note in (*self.log.notes, *self._odd_rates(), *self._far_truth()):
+        for note in (*self.log.notes, *self._odd_rates(), *self._odd_markers(), *self._far_truth()):
             warnings.warn(f"{self.where}: {note}", DataWarning, stacklevel=2)
 
     def _kept(self, robots: Sequence[str] | None) -> tuple[int, ...]:
@@ -161,15 +162,36 @@ class Bag(TickGenerator):
                 yield f"{row.topic}: {row.rate:.1f} frames per second, the environment has {self._rate:g}: {hint}"
 
     def _far_truth(self) -> Iterator[str]:
-        """Yield the cars whose median distance from the nearest landmark is far above the extent of all landmarks."""
+        """Yield the cars whose motion capture is far from all landmarks, or does not fit to their bearings."""
         places, hint = marker_places(self.scenario.landmarks)[:, :2], "are its unit (m) and frames.truth right?"
         width = float(np.linalg.norm(np.ptp(places, axis=0))) if len(places) else 0.0
         for car in self.binding.cars if width > 0.0 else ():
             found = [s.value for s in self.log.samples if (s.car, s.role) == (car, Role.TRUTH)]
             at = np.array([value.position[:2] for value in found if isinstance(value, CarPose)]).reshape(-1, 1, 2)
             away = float(np.median(np.linalg.norm(at - places, axis=-1).min(axis=-1))) if len(at) else 0.0
+            misfit, topic = misfit_of_truth(self.log.samples, car, self.binding), f"motion capture of {car}"
+            if topics := [row.topic for row in self.log.rows if (row.car, row.role) == (car, Role.TRUTH.value)]:
+                topic += f", topic {topics[0]},"
             if away > FAR * width:
-                yield f"motion capture of {car} is {away:.3g} m from landmarks that span {width:.3g} m: {hint}"
+                yield f"{topic} is {away:.3g} m from landmarks that span {width:.3g} m: {hint}"
+            elif misfit > MISFIT_DEG:
+                why = "are its heading (rad), unit (m) and frames.truth right, and the markers?"
+                yield f"{topic} is {misfit:.0f} deg off the bearings to landmarks (median): {why}"
+
+    def _odd_markers(self) -> Iterator[str]:
+        """Yield which markers of the map were never detected, and how often others were."""
+        names, found = self.scenario.target_names, set[int]()
+        for sample in self.log.samples:
+            found |= {*getattr(sample.value, "markers", ())} if sample.car in self.binding.cars else set()
+        landmarks = {
+            n: names[target] for n, target in self.binding.targets.items() if target < len(self.scenario.landmarks)
+        }
+        unseen = [f"{number} ({name})" for number, name in sorted(landmarks.items()) if number not in found]
+        if unseen:
+            yield f"markers of landmarks that were never detected: {listed(unseen)}"
+        if others := self.log.unknown_markers:
+            counts = [f"{number} ({count} times)" for number, count in sorted(others.items())]
+            yield f"detected markers that are not in the map: {listed(counts)}"
 
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
         """Go through the bags tick by tick; the option `arm` has no effect."""

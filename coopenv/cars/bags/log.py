@@ -95,7 +95,11 @@ ReadValue = Callable[[Chosen, Any], Value]
 
 
 def value_reader(
-    given: TopicMap, binding: Binding, chosen: Collection[Chosen], calibrations: Mapping[str, Calibration]
+    given: TopicMap,
+    binding: Binding,
+    chosen: Collection[Chosen],
+    calibrations: Mapping[str, Calibration],
+    unknown: Counter[int],
 ) -> ReadValue:
     """Return the reader of messages by the map.
 
@@ -104,6 +108,7 @@ def value_reader(
         binding: the cars and their vehicles.
         chosen: the topics that are read.
         calibrations: of the cars' cameras.
+        unknown: counts detections of markers that are not in the map.
     """
     known, turning = frozenset(binding.targets), {entry.car for entry in chosen if entry.role is Role.IMU}
     right = Correction()
@@ -113,7 +118,12 @@ def value_reader(
         calibration = calibrations.get(entry.car)
         if entry.role is Role.MANUAL:
             return read_drive(encode(message), binding.profile.command)
-        value = read(entry.role, message, calibration, distorted=given.distorted, known=known, vision=given.vision)
+        value = read(entry.role, message, calibration, distorted=given.distorted, vision=given.vision)
+        if isinstance(value, Detections) and (others := [m for m in value.markers if m not in known]):
+            unknown.update(others)
+            there = [m in known for m in value.markers]
+            markers = tuple(m for m in value.markers if m in known)
+            value = replace(value, markers=markers, bearings=value.bearings[there], dropped=value.dropped + len(others))
         if isinstance(value, CarPose):
             return in_frame(value, frames.get(entry.role, given.frames.map))
         if isinstance(value, Twist):
@@ -323,7 +333,9 @@ class BagLog:
     notes: tuple[str, ...]  # remarks for the user
     lenses: Mapping[str, Calibration] = field(default_factory=dict)  # by car; none: its bearings are without pixels
     added: Mapping[tuple[str, Role], tuple[str, float]] = field(default_factory=dict)
-    """Topic, and s added to its stamps, by car and role."""
+    """By car and role: the topic, and s that were added to its stamps."""
+    unknown_markers: Mapping[int, int] = field(default_factory=dict)
+    """Detections by the number of the marker, of markers that are not in the map."""
     sent: Mapping[tuple[str, Role], tuple[Sample, ...]] = field(default_factory=dict)
     """Samples with unchanged times, by car and role."""
 
@@ -349,7 +361,8 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
             lenses = {name: replace(lens, distortion=(0.0,) * 5) for name, lens in lenses.items()}
         lenses |= _published(files, chosen, given)  # a calibration that a car publishes replaces the environment's
         lenses |= {car: made.lens(lenses[car]) for car, made in given.corrections.items() if car in lenses}
-        value, mode = value_reader(given, binding, chosen, lenses), given.clocks.mode
+        unknown = Counter[int]()
+        value, mode = value_reader(given, binding, chosen, lenses, unknown), given.clocks.mode
         tracks = [track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, given.clocks)]
     known = sorted(entry.topic for entry in chosen)
     for key in ("offsets", "leads"):
@@ -388,7 +401,8 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         shift, topic = clocks.shifts.get(track.source), track.chosen.topic
         moved = (moves.get(topic, 0) + (shift.added if shift else 0)) / NS + given.clocks.leads.get(topic, 0.0)
         added.setdefault((track.chosen.car, track.chosen.role), (topic, moved))
-    return BagLog(samples, rows_of(files, chosen, samples, clocks, tracks, leads), tuple(notes), pixels, added, sent)
+    rows = rows_of(files, chosen, samples, clocks, tracks, leads)
+    return BagLog(samples, rows, tuple(notes), pixels, added, unknown, sent)
 
 
 def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:

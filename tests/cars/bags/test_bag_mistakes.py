@@ -30,6 +30,7 @@ from coopenv.cars.bags.topic_map import TopicMapError, load_map
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import Detections, Twist
 from coopenv.cli.app import main
+from coopenv.estimation.poses import exp_so3
 from coopenv.scenario import load_scenario
 from tests.helpers import bags
 from tests.helpers.bags import MAP
@@ -326,7 +327,9 @@ def test_motion_capture_far_from_the_map_is_warned_of(tmp_path: Path) -> None:
         place = m.fields["pose"].position
         pose = codec.pose(np.eye(3), np.array([place.x + 1500.0, place.y, place.z]))
         drive.append(replace(m, fields={"pose": pose}))
-    with pytest.warns(DataWarning, match=r"motion capture of svea3 is .* m from landmarks that span .* right\?"):
+    with pytest.warns(
+        DataWarning, match=r"motion capture of svea3, topic .*, is .* m from landmarks that span .* right\?"
+    ):
         opened(tmp_path, MAP, drive)
 
 
@@ -484,3 +487,34 @@ def test_rosbags_unpacks_nothing(form: str, tmp_path: Path, monkeypatch: pytest.
         for name in list(table):
             monkeypatch.delitem(table, name)
     assert read(path) == 3
+
+
+def warned(folder: Path, text: str, drive: list[bags.Message]) -> list[str]:
+    """Return the warnings at the opening of a bag."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        opened(folder, text, drive)
+    return [str(w.message) for w in caught if issubclass(w.category, DataWarning)]
+
+
+def test_truth_in_another_unit_or_frame_is_noticed(tmp_path: Path) -> None:
+    def changed(turn: float, scale: float) -> list[bags.Message]:
+        def of(m: bags.Message) -> bags.Message:
+            pose = m.fields["pose"]
+            R, p = exp_so3(np.array([0.0, 0.0, turn])), pose.position
+            return replace(m, fields={"pose": codec.pose(R, np.array([p.x, p.y, p.z]) * scale)})
+
+        return [of(m) if "qualisys" in m.topic else m for m in longer()]
+
+    assert not warned(tmp_path / "right", MAP, longer())
+    [line] = warned(tmp_path / "turned", MAP, changed(-1.5, 1.0))
+    assert re.search(r"motion capture of svea3, topic /qualisys/svea3/pose, is \d+ deg off the bearings", line)
+    [line] = warned(tmp_path / "mm", MAP, changed(1.8, 1000.0))
+    assert "m from landmarks" in line and "/qualisys/svea3/pose" in line
+
+
+def test_markers_of_one_side_alone_are_counted(tmp_path: Path) -> None:
+    text = MAP.replace("SL1 = 1, SL2 = 2", "SL1 = 9, SL2 = 2")
+    lines = warned(tmp_path, text, longer())
+    assert any("markers of landmarks that were never detected: 9 (SL1)" in line for line in lines)
+    assert any(re.search(r"detected markers that are not in the map: 1 \(\d+ times\)", line) for line in lines)
