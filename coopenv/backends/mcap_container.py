@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 
 from coopenv.backends.mcap_format import CUT_OFF, MAGIC, MENDED, is_cut_off
-from coopenv.base.errors import DataError, check_memory, shown
+from coopenv.base.errors import DataError, check_memory, regular, shown
 
 AT_ONCE = 32 * 2**20
 """Bytes that a chunk, or a message, may unpack to: a raw 4K image fits. Writers of logs make chunks of about 1 MiB."""
@@ -155,7 +155,7 @@ class Container:
             DataError: it is no MCAP file, or cut off; other errors are the library's.
         """
         check_memory(path.stat().st_size, f"{path}:")
-        self._data = path.read_bytes()
+        self._data = regular(path).read_bytes()
         if not self._data.startswith(MAGIC):
             raise DataError(f"{path}: not an MCAP file (it does not begin as one)")
         self.cut_off = is_cut_off(path)

@@ -18,7 +18,7 @@ from typing import Annotated, Any, NamedTuple, Self
 import numpy as np
 from pydantic import Field, create_model
 
-from coopenv.base.errors import CoopenvError, DataError
+from coopenv.base.errors import CoopenvError, DataError, regular
 from coopenv.base.format import jsonable
 from coopenv.base.installation import install_command, message_types, needing, version
 from coopenv.base.sections import Number, Section, Vector3, validated
@@ -171,7 +171,7 @@ MENDED = f"`{REPAIR}` mends it"
 
 def is_cut_off(path: Path) -> bool:
     """Return whether a file begins as an MCAP file and does not end as one."""
-    with path.open("rb") as stream:
+    with regular(path).open("rb") as stream:
         if stream.read(len(MAGIC)) != MAGIC:
             return False
         size = stream.seek(0, 2)
@@ -183,7 +183,7 @@ def metadata_names(path: str | Path) -> frozenset[str] | None:
     """Return the names of the metadata that stand before a file's data; None: it cannot be read or is no MCAP file."""
     names = set()
     try:
-        with Path(path).open("rb") as stream:
+        with regular(path).open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 return None
             for _ in range(MOST_RECORDS):

@@ -12,7 +12,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.base.errors import DataError, DataWarning, suggest
+from coopenv.base.errors import DataError, DataWarning, regular, suggest
 from coopenv.estimation.poses import MISFIT_DEG, Array, about_z, bearing_misfit_deg
 
 NAMES = tuple(f"mrclam_{number}" for number in range(1, 10))
@@ -64,9 +64,9 @@ class Rows:
         Where `gaps` are allowed, rows are left out that have NaN behind their first column.
         """
         try:
-            self.path, self._text = path, path.read_text(encoding="utf-8-sig", errors="replace")
+            self.path, self._text = path, regular(path).read_text(encoding="utf-8-sig", errors="replace")
         except OSError as error:
-            why = f"cannot be read ({error.strerror})" if path.is_file() else "no such file"
+            why = f"cannot be read ({error.strerror})" if path.exists() else "no such file"
             raise DataError(f"{path}: {why}") from None
         try:
             with warnings.catch_warnings():

@@ -11,9 +11,11 @@ import re
 import secrets
 from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
+from errno import EINVAL
 from functools import wraps
 from hashlib import sha256
 from inspect import signature
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 P = ParamSpec("P")
@@ -105,6 +107,14 @@ def world_keys(seed: object, worlds: int = 1, first: int = 0) -> list[int]:
     if number >= 2**32:
         number = int.from_bytes(sha256(str(number).encode()).digest()[:4], "little") >> 1
     return [world << 32 | number for world in range(first, first + worlds)]
+
+
+def regular(path: str | Path) -> Path:
+    """Return the path of a file to read. Raises OSError: a pipe or a device, which may have no end."""
+    path = Path(path)
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(EINVAL, "no regular file")
+    return path
 
 
 def check_memory(size: float, what: str, available: int | None = None) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from coopenv.base.errors import CoopenvError, check_one_of, listed, shortened, shown, suggest
+from coopenv.base.errors import CoopenvError, check_one_of, listed, regular, shortened, shown, suggest
 
 CHANGE = "scenario | {'dotted.key': value} returns a changed scenario"
 _METHODS = ("figure", "model_dump", "model_dump_json")
@@ -124,7 +124,7 @@ def read_toml(path: Path, error: type[CoopenvError] = CoopenvError, where: str |
     """
     where = where or str(path)
     try:
-        with path.open("rb") as stream:
+        with regular(path).open("rb") as stream:
             content = stream.read(MOST_BYTES + 1)
         if len(content) > MOST_BYTES:
             raise error(f"{where}: larger than {MOST_BYTES // 2**20} MiB")

@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from errno import EFBIG
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +21,7 @@ from xml.etree.ElementTree import Element, ParseError, iterparse
 import numpy as np
 from pydantic import Field
 
-from coopenv.base.errors import ScenarioError, shown
+from coopenv.base.errors import ScenarioError, regular, shown
 from coopenv.base.sections import NonNegative, Number, Positive, Section, Word
 
 Setting = bool | int | Number | Word | tuple[Number, ...] | None
@@ -224,11 +225,30 @@ def _network(path: Path, modified: int) -> SumoNetwork:
     return found
 
 
+MOST_BYTES = 2**30
+"""Of the XML of a network or of routes, unpacked."""
+
+
+class _LimitedReader:
+    """Reads a file up to a limit."""
+
+    def __init__(self, file: Any) -> None:
+        self._file, self._left = file, MOST_BYTES
+
+    def read(self, size: int = -1) -> bytes:
+        """Return bytes of the file. Raises OSError: it has more than the limit."""
+        data: bytes = self._file.read(size)
+        self._left -= len(data)
+        if self._left < 0:
+            raise OSError(EFBIG, f"more than {MOST_BYTES // 2**20} MiB of XML")
+        return data
+
+
 def _elements(path: Path) -> Iterator[Element]:
     """Yield the elements below the root of a file, plain or .gz."""
+    path, depth = regular(path), 0
     with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-        depth = 0
-        for event, element in iterparse(file, events=("start", "end")):
+        for event, element in iterparse(_LimitedReader(file), events=("start", "end")):
             depth += 1 if event == "start" else -1
             if event == "end" and depth == 1:
                 yield element

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +18,11 @@ from coopenv.backends.mcap import write_recording
 from coopenv.backends.sources import Selection, open_recording
 from coopenv.base.errors import DataWarning
 from coopenv.bench.observers import compare
+from coopenv.cars.bags.topic_map import load_map
 from coopenv.cli.app import main
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Truth, check_recording
+from coopenv.scenario import cosimulators
 from tests.helpers import mrclam_files
 from tests.helpers.recordings import simulated
 
@@ -201,3 +205,26 @@ def test_arrays_with_a_truth_in_another_frame_are_noticed(whole: Recording) -> N
     turned = given["truth_rotation"] @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     with pytest.warns(DataWarning, match=r"truth of vehicle_1: bearings to landmarks are 90 deg off \(median\)"):
         Recording.from_arrays(**(given | {"truth_rotation": turned}))
+
+
+def test_pipes_are_refused_and_do_not_block(tmp_path: Path) -> None:
+    for name in ("log.mcap", "topics.toml", "drive.bag"):
+        os.mkfifo(tmp_path / name)
+    folder = mrclam_files.write(tmp_path, seconds=2.0)
+    (folder / "Barcodes.dat").unlink()
+    os.mkfifo(folder / "Barcodes.dat")
+    for work in (
+        lambda: open_recording(tmp_path / "log.mcap"),
+        lambda: load_map(tmp_path / "topics.toml"),
+        lambda: open_recording("mrclam_6", tmp_path),
+    ):
+        with pytest.raises(CoopenvError, match=r"(log\.mcap|topics\.toml|Barcodes\.dat).*no regular file"):
+            work()
+
+
+def test_packed_networks_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "bomb.net.xml.gz"
+    path.write_bytes(gzip.compress(b"<net>" + b" " * 3 * 2**20))
+    monkeypatch.setattr(cosimulators, "MOST_BYTES", 2**20)
+    with pytest.raises(CoopenvError, match=r"sumo\.net: .*bomb\.net\.xml\.gz.*: more than 1 MiB of XML"):
+        cosimulators._read_network(cosimulators.Sumo(net=str(path)))

@@ -19,6 +19,7 @@ from rosbags.typesys.msg import normalize_msgtype
 from coopenv.backends import mcap_container as container
 from coopenv.backends.mcap_container import Allowance, TooLargeError, messages_of, records_of
 from coopenv.backends.mcap_format import MAGIC, is_cut_off
+from coopenv.base.errors import regular
 
 FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
 ENDS_EARLY = "its end is missing"
@@ -80,7 +81,7 @@ class Part:
 
 
 def _of_mcap(path: Path, allowance: Allowance) -> Entries:
-    with path.open("rb") as stream:
+    with regular(path).open("rb") as stream:
         if stream.read(len(MAGIC)) != MAGIC:
             raise ValueError("not an MCAP file")
         records = records_of(stream, max(container.AT_ONCE, path.stat().st_size), allowance)
@@ -141,7 +142,7 @@ def _of_sqlite3(path: Path, _: Allowance) -> Entries:
 
 def _of_ros1(path: Path, allowance: Allowance) -> Entries:
     known: dict[int, About] = {}
-    with path.open("rb") as stream:
+    with regular(path).open("rb") as stream:
         if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
             raise ValueError("no bag of ROS 1")
         for header, data in _ros1_records(stream, allowance):
