@@ -11,7 +11,7 @@ from coopenv.api.arguments import RewardFunction
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.vector_env import ActingRows, ArrayKind, CooperativeVectorEnv
 from coopenv.backends.base import Backend
-from coopenv.backends.sources import open_backend, open_simulation
+from coopenv.backends.sources import open_backend, open_simulation, source_name
 from coopenv.base.errors import CoopenvError, explained
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import with_observer
@@ -80,7 +80,7 @@ def parallel_env(
             {"deployment": deployment, "car": car, "record": record, "connect": connect},
             topics,
         ),
-        scenario_name(name_or_path),
+        source_name(name_or_path),
         render_mode=render_mode,
         observation=observation,
         device=device,

@@ -80,7 +80,7 @@ class Selection:
                 raise CoopenvError(f"{option}: expected a time of at least 0 s, got {shown(time)}")
         if until is not None and until <= (start or 0.0):
             raise CoopenvError(f"until: {until:g} s are not after the start at {start or 0.0:g} s")
-        given = str(robots).split(",") if isinstance(robots, str | int) else robots
+        given: Any = str(robots).split(",") if isinstance(robots, str | Real) else robots
         names = None if given is None else tuple(dict.fromkeys(_robot_name(robot) for robot in given))
         if names is not None and ("" in names or not names):
             raise CoopenvError(f"robots: expected names or numbers such as 1,3, got {shown(robots)}")
@@ -116,7 +116,8 @@ class Selection:
         first = math.ceil((self.start or 0.0) / recording.dt / period - 1e-6) * period
         last = recording.ticks - 1 if self.until is None else round(self.until / recording.dt)
         if last >= recording.ticks or first >= last:
-            option, time = ("until", self.until) if last >= recording.ticks else ("from", self.start)
+            beyond = self.start is not None and (self.until is None or self.start > length)
+            option, time = ("from", self.start) if beyond else ("until", self.until)
             raise DataError(f"{where}: {option}: {time:g} s; {length:g} s are recorded, in steps of {recording.dt:g} s")
         return stretch(recording, first, last, where)
 

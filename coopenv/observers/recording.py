@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from itertools import chain
+from numbers import Integral, Real
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -197,14 +198,21 @@ class Recording(Measurements):
         (K, N, _), L = arrays["velocity"].shape, len(arrays["landmarks"])
         T = L + N
         _require(K > 1 and N > 0, f"velocity: expected {_SHAPES['velocity']}, K > 1, got shape {(K, N, 3)}")
+        for name, value, kind, expected in (
+            ("dt", dt, Real, "a number of s"),
+            ("period", period, Integral, "a whole number of ticks"),
+            ("noise", noise, SensorNoise, "a SensorNoise"),
+        ):
+            _require(isinstance(value, kind), f"{name}: expected {expected}, got {shown(value)}")
         _between("dt", dt, *TICK_LENGTHS_S)
         _between("period", period, 1, MAX_PERIOD_TICKS)
+        std = _numbers("start_std", start_std)
+        positive = std.shape == (2,) and (std > 0.0).all()
+        _require(positive, f"start_std: expected two positive numbers, got {shown(start_std)}")
         unknown = {"truth_position": np.full((K, N, 3), np.nan), "truth_rotation": np.full((K, N, 3, 3), np.nan)}
         arrays = unknown | arrays
-        for part in ("position", "rotation"):
-            arrays.setdefault(f"start_{part}", arrays[f"truth_{part}"][0])
         for name, array in arrays.items():
-            shape = tuple({"K": K, "N": N, "L": L, "T": T}.get(axis) or int(axis) for axis in _SHAPES[name].split())
+            shape = tuple({"K": K, "N": N, "L": L, "T": T, "3": 3}[axis] for axis in _SHAPES[name].split())
             _require(array.shape == shape, f"{name}: expected {_SHAPES[name]} = {shape}, got {array.shape}")
         for name in ("landmarks", "velocity", "angular_velocity"):
             _require(
@@ -212,12 +220,13 @@ class Recording(Measurements):
                 f"{name}: not finite at {np.argwhere(~np.isfinite(arrays[name]))[:1].tolist()}",
             )
         for part in ("position", "rotation"):
+            arrays.setdefault(f"start_{part}", arrays[f"truth_{part}"][0])
             known = np.isfinite(arrays[f"start_{part}"]).all()
             _require(known, f"start_{part}: needed, as the first true one is not known")
         turn, step = arrays["angular_velocity"] * dt, arrays["velocity"] * dt
         turn[0], step[0] = 0.0, 0.0
         names = (*(f"landmark_{n + 1}" for n in range(L)), *(f"vehicle_{n + 1}" for n in range(N)))
-        gains = Gains(1.0, np.full(T, 10.0), (0.1, 1.0), (start_std[0] ** 2, start_std[1] ** 2), 0.1)
+        gains = Gains(1.0, np.full(T, 10.0), (0.1, 1.0), (float(std[0] ** 2), float(std[1] ** 2)), 0.1)
         targets, here = np.arange(T), np.zeros(3)
         recording = cls(
             setups=tuple(
@@ -238,7 +247,7 @@ class Recording(Measurements):
             due=np.ones(K, bool),
             start_rotation=arrays["start_rotation"],
             start_position=arrays["start_position"],
-            start_covariance=np.tile(np.diag(np.repeat(np.square(start_std), 3)), (N, 1, 1)),
+            start_covariance=np.tile(np.diag(np.repeat(np.square(std), 3)), (N, 1, 1)),
             truth=Truth(arrays["truth_rotation"], arrays["truth_position"]),
         )
         check_recording(recording, "recording")

@@ -92,6 +92,7 @@ def test_a_recording_is_taken_as_an_object(whole: Recording, tmp_path: Path) -> 
     assert [r.position_rmse_m for r in by_object.rows] == [r.position_rmse_m for r in by_name.rows]
     result = coopenv.run(part(whole, until=2.0), observer="riccati", steady_from=1.0)
     assert result.metrics["environment"] == "recording" and len(result.metrics["vehicles"]) == 5
+    assert coopenv.parallel_env(recording).possible_agents == [setup.name for setup in recording.setups]
     for options in ({"data": tmp_path}, {"topics": "x.toml"}, {"overrides": {"horizon": 1.0}}):
         with pytest.raises(CoopenvError, match="a Recording was given"):
             coopenv.compare(["mekf"], recording, **options)
@@ -119,6 +120,8 @@ def test_the_commands_take_a_part(data: Path, tmp_path: Path, capsys: pytest.Cap
         (("5", None, None), "from: expected a time"),
         ((None, None, ""), "robots: expected names or numbers such as 1,3, got ''"),
         ((None, None, []), "robots: expected names or numbers such as 1,3"),
+        ((None, None, 1.5), "drive: robots: unknown robot '1.5'"),
+        ((None, 0.01, None), "drive: until: 0.01 s; 11.35 s are recorded, in steps of 0.05 s"),
         ((None, None, [9]), "drive: robots: unknown robot 'vehicle_9'.* known: vehicle_1, vehicle_2"),
         ((None, 1e4, None), "drive: until: 10000 s; 11.35 s are recorded, in steps of 0.05 s"),
         ((1e4, None, None), "drive: from: 10000 s; 11.35 s are recorded"),
@@ -181,6 +184,7 @@ def test_a_recording_is_made_of_arrays(whole: Recording) -> None:
         ),
         ({"bearings": np.full((228, 5, 10, 3), 0.7)}, "recording: bearings of vehicle_1, tick 0: not unit vectors"),
         ({"velocity": np.full((228, 5, 3), np.nan)}, r"velocity: not finite at \[\[0, 0, 0\]\]"),
+        ({"truth_position": 3.0}, r"truth_position: expected K N 3 = \(228, 5, 3\), got \(\)"),
         ({"landmarks": [["a", 1, 2]]}, "landmarks: not an array of numbers"),
         ({"dt": 0.0}, "dt: 0.0 is not in 1e-05"),
         ({"period": 0}, "period: 0 is not in 1"),
@@ -192,7 +196,12 @@ def test_a_recording_is_made_of_arrays(whole: Recording) -> None:
             {"truth_rotation": np.full((228, 5, 3, 3), 57.3)},
             "recording: truth.rotation of vehicle_1, tick 0: not a rot",
         ),
-        ({"start_std": (0.0, 0.0)}, "recording: .*(start_covariance|P0)"),
+        ({"start_std": (0.0, 0.0)}, "start_std: expected two positive numbers"),
+        ({"start_std": 0.1}, "start_std: expected two positive numbers, got 0.1"),
+        ({"dt": "0.1"}, "dt: expected .*, got '0.1'"),
+        ({"period": 1.5}, "period: expected .*, got 1.5"),
+        ({"noise": None}, "noise: expected .*SensorNoise.*, got None"),
+        ({"landmarks": np.zeros((0, 3))}, r"bearings: expected K N T 3 = \(228, 5, 5, 3\), got"),
     ],
 )
 def test_arrays_that_do_not_fit_are_one_line(whole: Recording, change: dict[str, Any], line: str) -> None:
