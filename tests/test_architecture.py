@@ -109,7 +109,7 @@ LINES_AND_FILES = {
     "world": (5601, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
-MOST_FILES = 241
+MOST_FILES = 242
 
 
 def test_wings_keep_their_budgets() -> None:

@@ -41,8 +41,8 @@ REPLACED = {
     r"\"\"\"(?:what|who|whose|whom|how|those)": "a noun phrase or an imperative at the beginning of a docstring",
 }
 """Words of which a page and a program have none, as regular expressions, and words that take their place."""
-KEPT = ("liar_among_us", "Liar among us", "lane_liar", "ring_liar", '["heard"]', '"heard":', '"""What vehicle and env')
-"""Names that stay: of an environment and scenes of the leaderboard, of a saved field, and of a moved constant."""
+KEPT = ("liar_among_us", "Liar among us", "lane_liar", "ring_liar", '["heard"]', '"heard":')
+"""Names that stay: of an environment and scenes of the leaderboard, and of a saved field."""
 PROGRAMS = [
     file
     for folder, kinds in {"coopenv": "py", "examples": "py toml", "envs": "toml", "agents": "py toml md"}.items()

@@ -159,7 +159,7 @@ class Container:
         if not self._data.startswith(MAGIC):
             raise DataError(f"{path}: not an MCAP file (it does not begin as one)")
         self.cut_off = is_cut_off(path)
-        """Whether the end is missing."""
+        """True if the end is missing."""
         if self.cut_off and not truncated:
             raise DataError(f"{path}: {CUT_OFF}; {MENDED}")
 

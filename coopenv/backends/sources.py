@@ -88,7 +88,7 @@ class Selection:
 
     @property
     def given(self) -> dict[str, Any]:
-        """What is selected, by option."""
+        """Selected values by option."""
         values = {"from": self.start, "until": self.until, "robots": self.robots and ",".join(self.robots)}
         return {option: value for option, value in values.items() if value is not None}
 

@@ -211,7 +211,7 @@ class Address:
 
     @property
     def loopback(self) -> bool:
-        """Whether it is on this computer, whatever its networks: 127.0.0.0/8, ::1, localhost or a unix socket."""
+        """True if it is on this computer: 127.0.0.0/8, ::1, localhost or a unix socket."""
         if self.protocol == UNIX:
             return True
         try:

@@ -27,7 +27,7 @@ FARTHEST_REACH = 20.0
 SETS = ("landmark", "car")
 LAYERS, HEAD_LAYERS = 2, 3
 CONSTANTS = ("max_speed", "view_left", "view_right", "range", "sees_landmarks", "drift", "turn_drift", "bearing_std")
-"""What vehicle and environment do not change; the last entries of what a network sees beside the sets."""
+"""Properties of vehicle and environment, constant in an episode; the last inputs of a network beside the sets."""
 SLACK = 0.25
 """Share of a constant by which it may be beyond the training."""
 

@@ -176,8 +176,8 @@ def compare(
             that suit.
         environment: name, TOML file, dict or scenario, as for `coopenv.load_scenario`; recorded robots (`mrclam_1`,
             `mrclam_1_space`, ...), MCAP file, ROS bag or `Recording`.
-        seeds: how many (0, 1, ...), or which; None: 5. Of a bag they draw the initial estimates; other recorded data
-            are one record.
+        seeds: their number (0, 1, ...), or a list; None: 5. Of a bag they draw the initial estimates; other recorded
+            data are one record.
         variants: names, or "all": faults of an environment, what recorded robots see; None: the usual ones.
         overrides: dotted scenario keys, for example {"noise.enabled": False}.
         steady_from: start of the steady state, s; None: after 70 % of the run.

@@ -310,18 +310,18 @@ class Leaderboard:
     samples: Sequence[JudgedRun] = field(repr=False)
     """One observer on one record each, by variant, observer, seed."""
     recorded: bool = False
-    """Whether all seeds have the same recording, in which they draw the initial estimates alone."""
+    """True if all seeds have the same recording and draw the initial estimates only."""
     draws: Sequence[Draw] = field(default=(), repr=False)
     """Draws of initial estimates, by observer, where basins were studied."""
 
     @property
     def sampled(self) -> str:
-        """What standard errors are over."""
+        """Sample of the standard errors."""
         return "drawn starts of one recording" if self.recorded else "seeds"
 
     @property
     def runs(self) -> int:
-        """How many independent records there are."""
+        """Number of independent records."""
         return 1 if self.recorded else len(self.seeds)
 
     @cached_property

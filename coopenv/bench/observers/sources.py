@@ -66,9 +66,9 @@ class RecordSource(ABC):
     usual: ClassVar[tuple[str, ...]] = (NOMINAL,)
     """Variants that are run by default."""
     seeded: ClassVar[bool] = False
-    """Whether another seed gives another record."""
+    """True if the record depends on the seed."""
     recorded: ClassVar[bool] = True
-    """Whether all of its records are the same recording."""
+    """True if all of its records are the same recording."""
     windowed: ClassVar[bool] = True
     """Judge windows of time from the start on by default; robots on a plane have none."""
 

@@ -48,7 +48,7 @@ ENDLESS = {
     "termination.off_route": None,
     "termination.after_arrival": "park",
 }
-"""What was driven goes on beyond goals and contacts of the environment, and so do its errors."""
+"""Overrides by which a recorded drive and its errors continue beyond goals and contacts of the environment."""
 
 
 class Bag(TickGenerator):
@@ -213,11 +213,11 @@ def _used(sample: Sample) -> int:
 
 
 CAPTURE = re.compile(r"qualisys|mocap|vicon|optitrack|vrpn|truth|ground", re.IGNORECASE)
-"""In names of topics of motion capture."""
+"""Pattern in names of topics of motion capture."""
 COMMANDED = re.compile(r"cmd|command|setpoint|target", re.IGNORECASE)
-"""In names of topics that hold commands, whose types are those of measured twists."""
+"""Pattern in names of topics of commands, whose types are those of measured twists."""
 ANY_CAMERA = Calibration((100_000, 100_000), (1e5, 1e5), (5e4, 5e4), (0.0,) * 5)
-"""That has seen whatever was detected."""
+"""Intrinsics for which every detection is inside the image."""
 TO_WHEELS = (SVEA.topics[Role.MANUAL].type,)
 DRIFTING = 1e-5  # s per s from which a clock's drift is mentioned
 
