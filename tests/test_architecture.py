@@ -106,7 +106,7 @@ LINES_AND_FILES = {
     "scenario": (3769, 12),
     "training": (1612, 6),
     "viz": (4887, 16),
-    "world": (5601, 18),
+    "world": (5619, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 MOST_FILES = 242

@@ -25,13 +25,15 @@ import warp as wp
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import lock
-from coopenv.base.installation import available_cores
-from coopenv.world.warp_internals import field_types, replay_of
+from coopenv.base.installation import available_cores, data_directory
+from coopenv.world.warp_internals import cpu_features, field_types, replay_of
 
 ATTEMPTS = 3
 """Attempts to load a module: the second rebuilds it, the third is for two processes that rebuild the same one."""
 PROBE_BYTES = 5 << 20  # as much as the source and the code of a large module have
 LONGEST_COMPILATION = 120.0  # s; a process that holds a lock for longer is taken for suspended (Ctrl-Z)
+SHIPPED = data_directory("kernels")
+"""Compiled modules of the wheel; of a checkout those of `python -m benchmarks.kernels`."""
 _MODULE, _LOCKS = "wp_", "locks"
 """Prefix of the folders of modules; folder of the locks."""
 _loaded: set[str] = set()  # names of modules that this process has loaded
@@ -68,8 +70,13 @@ def launch(kernel: wp.Kernel, **options: Any) -> Any:
 
 
 def _launch(kernel: wp.Kernel, options: dict[str, Any]) -> Any:
+    folders = f"{_MODULE}{escape(kernel.module.name)}_{'[0-9a-f]' * 7}"
+    for module in SHIPPED.glob(folders):
+        if not (cached := cache_folder() / module.name).exists():
+            with suppress(OSError):  # it is compiled instead
+                shutil.copytree(module, cached)
     for attempt in range(ATTEMPTS):
-        kept = list(cache_folder().glob(f"{_MODULE}{escape(kernel.module.name)}_{'[0-9a-f]' * 7}"))
+        kept = list(cache_folder().glob(folders))
         if not kept:
             probe()  # LLVM ends the process where it cannot write
         try:
@@ -189,6 +196,8 @@ def module_kernels(name: str, p: Any, *functions: Callable[..., None], **options
 INLINE_THRESHOLD = 2000
 """Cost up to which LLVM inlines a function. Warp's 9000 compiles longer and runs no faster; 1000 makes steps a tenth
 slower."""
+X86_64_V3 = frozenset({"avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"})
+"""Features of processors that share compiled kernels, those of a wheel among them. AVX-512 makes no step faster."""
 
 
 def compiler_options() -> dict[str, Any]:
@@ -200,7 +209,10 @@ def compiler_options() -> dict[str, Any]:
     flags = (wp.config.cpu_compiler_flags or "").split()
     if not any("-inline-threshold" in flag for flag in flags):
         return {}
+    start_warp()
     kept = [flag for flag in flags if not flag.startswith("-mllvm")]
+    if "-march=native" in kept and cpu_features() >= X86_64_V3:
+        kept = [*(flag for flag in kept if flag != "-march=native"), "-target-cpu", "x86-64-v3"]
     threshold = f"-mllvm=-inline-threshold={INLINE_THRESHOLD}"
     return {"cpu_compiler_flags": " ".join([*kept, threshold])}
 

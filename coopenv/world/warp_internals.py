@@ -6,6 +6,7 @@
 | `device_function`, `subroutine` | `Function.__class__`, `inline_hint`, `overload.adj` | records by reference |
 | `struct_of`, `field_types` | `StructInstance._cls`, `Struct.vars` | fields of a record |
 | `scalar_of` | `_wp_scalar_type_` | the NumPy type of an array of vectors |
+| `cpu_features` | `context._get_cpu_feature_set` | the processor, as LLVM names it |
 | `kernel_hashes` | `context.user_modules`, `Module.get_module_hash` | versions of kernels in a report of a run |
 | `_kernel_source` | `codegen.codegen_kernel`, `Adjoint.args` | no copies of records; no kernels of the host on CUDA |
 | `_function_source` | `codegen.codegen_func`, `codegen.cpu_module_header` | CPU: indices and loops as in C |
@@ -19,6 +20,11 @@ from typing import Any
 
 import warp as wp
 from warp._src import codegen, context
+
+
+def cpu_features() -> frozenset[str]:
+    """Return LLVM's names of the features of this processor; Warp must be initialised."""
+    return frozenset(context._get_cpu_feature_set())
 
 
 def replay_of(command: Any) -> Callable[[], Any]:

@@ -180,11 +180,18 @@ def test_what_is_no_record_stays_a_value() -> None:
     assert increased.get_overload([wp.float32], {}).input_types == {"state": wp.float32}
 
 
-def test_the_threshold_of_inlining_replaces_that_of_warp(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("features", "target"),
+    [(launch.X86_64_V3 | {"avx512f"}, "-O1 -target-cpu x86-64-v3"), ({"avx2"}, "-march=native -O1")],
+)
+def test_kernels_have_one_threshold_of_inlining_and_are_shared_by_processors_of_a_level(
+    monkeypatch: pytest.MonkeyPatch, features: set[str], target: str
+) -> None:
     flags = "-march=native -mllvm=-inline-threshold=9000 -O1 -mllvm=-slp-recursion-max-depth=4"
     monkeypatch.setattr(wp.config, "cpu_compiler_flags", flags)
     monkeypatch.setattr(launch, "INLINE_THRESHOLD", 7)
-    assert launch.compiler_options()["cpu_compiler_flags"] == "-march=native -O1 -mllvm=-inline-threshold=7"
+    monkeypatch.setattr(launch, "cpu_features", lambda: frozenset(features))
+    assert launch.compiler_options()["cpu_compiler_flags"] == f"{target} -mllvm=-inline-threshold=7"
 
 
 @pytest.mark.parametrize("flags", [None, "", "-march=native -O0"])
@@ -349,3 +356,14 @@ def test_a_full_disk_is_reported_before_the_compiler_meets_it(program: Path, dis
     done = run(sys.executable, program, WARP_CACHE_PATH=disk)
     assert "No space left on device; set the variable WARP_CACHE_PATH" in done.stdout
     assert done.stderr == ""
+
+
+def test_modules_of_a_wheel_are_copied_and_not_compiled(tmp_path: Path) -> None:
+    step = "e = coopenv.parallel_env('busy_intersection'); e.reset(seed=0); e.step({a: [0, 0] for a in e.agents})"
+    exec(step, {"coopenv": coopenv})  # compiles them, at most
+    begin = "import coopenv, pathlib, warp; from coopenv.world import launch; warp._src.build.build_cpu = None"
+    code = f"{begin}; launch.SHIPPED = pathlib.Path({os.fspath(launch.cache_folder())!r}); {step}"
+    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert len([*tmp_path.rglob("*.o")]) >= 2
