@@ -17,8 +17,8 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import CoopenvError, check_one_of
-from coopenv.cars.fake.sensors import WALL, FrameRenderer, PlacedTag
-from coopenv.cars.profile import FAMILIES
+from coopenv.base.sections import FAMILIES
+from coopenv.cars.frames import WALL, FrameRenderer, PlacedTag
 from coopenv.cars.vision import Calibration, find_tags
 from coopenv.estimation.poses import Array
 from coopenv.runs.console import number_table

@@ -260,6 +260,11 @@ def _points_somewhere(direction: tuple[float, float, float]) -> tuple[float, flo
     return direction
 
 
+def _tag_family(name: str) -> str:
+    check_one_of("unknown family", name, FAMILIES, ValueError)
+    return name
+
+
 def _readable(text: str) -> str:
     for line in text.splitlines():
         if not line.replace("\t", " ").isprintable():
@@ -287,3 +292,11 @@ Sample = Literal["sample"]
 Word = Annotated[str, AfterValidator(_readable)]
 Text = Annotated[str, Field(max_length=10_000), AfterValidator(_readable)]
 """Printed as it is, so that nothing in it may command a terminal."""
+
+FAMILIES = (
+    *("tag16h5", "tag25h9", "tag36h10", "tag36h11"),
+    *(f"DICT_{n}X{n}_{count}" for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
+    *("DICT_ARUCO_ORIGINAL", "DICT_ARUCO_MIP_36h12"),
+)
+"""Families of tags: AprilTag's as they are called there, ArUco's as in OpenCV."""
+TagFamily = Annotated[str, AfterValidator(_tag_family)]

@@ -9,10 +9,10 @@ from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from coopenv.base.errors import CoopenvError, check_one_of, listed, shown, suggest
-from coopenv.base.sections import Section, read_toml, validated
+from coopenv.base.errors import CoopenvError, listed, shown, suggest
+from coopenv.base.sections import Section, TagFamily, read_toml, validated
 
 
 @dataclass(frozen=True)
@@ -319,26 +319,13 @@ class RemotePulses(Section):
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 """Types of a camera's frames."""
 
-FAMILIES = (
-    *("tag16h5", "tag25h9", "tag36h10", "tag36h11"),
-    *(f"DICT_{n}X{n}_{count}" for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
-    *("DICT_ARUCO_ORIGINAL", "DICT_ARUCO_MIP_36h12"),
-)
-"""Families of tags: AprilTag's as they are called there, ArUco's as in OpenCV."""
-
-
-def _family(name: str) -> str:
-    check_one_of("unknown family", name, FAMILIES, ValueError)
-    return name
-
-
 Hue = Annotated[float, Field(ge=0.0, le=360.0)]
 
 
 class VisionSettings(Section):
     """Frames of a camera, and tags that were detected in them."""
 
-    family: Annotated[str, AfterValidator(_family)] = "tag36h11"
+    family: TagFamily = "tag36h11"
     """Family of the tags: `tag16h5` to `tag36h11` of AprilTag, `DICT_4X4_50` to `DICT_7X7_1000` of ArUco."""
     colours: dict[int, tuple[Hue, Hue]] = Field(default={})
     """Hues, deg, from the first to the second (red 0, green 120, blue 240), by number of a marker. With any, blobs of

@@ -12,7 +12,7 @@ from coopenv import CoopenvError
 from coopenv.cars.bags.bag import Bag, examined, proposed
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.codec import make
-from coopenv.cars.fake.sensors import FrameRenderer, PlacedTag
+from coopenv.cars.frames import FrameRenderer, PlacedTag
 from coopenv.cars.profile import Role, VisionSettings
 from coopenv.cars.readings import Detections, read
 from coopenv.cars.vision import Calibration, find_tags, frame_of
