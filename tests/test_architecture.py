@@ -93,20 +93,20 @@ def test_a_class_name_means_one_class() -> None:
 LINES_AND_FILES = {
     ".": (129, 2),
     "api": (4402, 19),
-    "backends": (4008, 15),
+    "backends": (4012, 15),
     "base": (1947, 10),
     "bench": (5512, 18),
-    "cars": (11250, 43),
+    "cars": (11366, 43),
     "cli": (2719, 9),
     "estimation": (1917, 7),
     "evaluation": (492, 3),
-    "observers": (11874, 42),
+    "observers": (11875, 42),
     "policies": (2078, 10),
-    "runs": (3569, 13),
-    "scenario": (3769, 12),
+    "runs": (3572, 13),
+    "scenario": (3812, 12),
     "training": (1612, 6),
     "viz": (4887, 16),
-    "world": (5619, 18),
+    "world": (5623, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 MOST_FILES = 242

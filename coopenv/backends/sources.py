@@ -246,6 +246,10 @@ def simulation_of(scenario: Scenario) -> Simulated:
         from coopenv.backends.cosimulation import Cosimulated
 
         return Cosimulated(scenario)
+    if scenario.sensing == "images":
+        from coopenv.cars.frames import Rendered
+
+        return Rendered(scenario)
     from coopenv.backends.worlds import Simulated
 
     return Simulated(scenario)

@@ -1,4 +1,4 @@
-"""Frames with tags: the renderer."""
+"""Frames with tags: a renderer, and worlds whose bearings come from rendered frames by the detector of tags."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -8,9 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from coopenv.backends.worlds import Simulated, SimulatedWorld
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.vision import Calibration, dictionary_of, opencv, rays
+from coopenv.cars.vision import Calibration, dictionary_of, find_tags, opencv, rays
+from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array
+from coopenv.scenario import Scenario
+from coopenv.world.random import BEARING_NOISE
+from coopenv.world.step import Kernels, source_kernels
 
 INSIDE = (np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0)), axis=-1).reshape(-1, 2) - 1.5) / 4.0
 """Rays through a pixel, from its middle: downwards and to the right, in pixels."""
@@ -118,3 +123,114 @@ def _cells(at: Array, cells: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         on = np.where(at[..., 2:] > 0.0, at[..., :2] / at[..., 2:], -1.0)
     column, row = np.moveaxis(np.floor(on).clip(-1, cells).astype(np.intp) + 1, -1, 0)
     return row, column
+
+
+class RenderedWorld(SimulatedWorld):
+    """A world whose bearings are those of tags in rendered frames; all else is as in the simulation.
+
+    The world decides which tags a vehicle has in view; nearer tags cover those behind them in its frame.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        worlds: int = 1,
+        dtype: str = "float32",
+        device: str = "cpu",
+        threads: int | None = None,
+        *observer: Any,
+    ) -> None:
+        """Build the arrays and the renderers; arguments as for `World`, `threads` is not used.
+
+        Raises:
+            CoopenvError: more than one world, or not on the CPU; and as for `World`.
+        """
+        if worlds != 1 or device != "cpu":
+            where = f"got num_worlds={worlds}, device='{device}'"
+            raise CoopenvError(f"sensing: 'images' renders one world on the CPU: num_worlds=1, device='cpu', {where}")
+        super().__init__(scenario, worlds, dtype, device, 1, *observer)
+        self._cameras = scenario.cameras
+        self._noisy = [noise.enabled for noise in scenario.noises]
+        self._renderers = [FrameRenderer(Calibration.of(camera), scenario.images.family) for camera in self._cameras]
+
+    @property
+    def _world_kernels(self) -> Kernels:
+        return source_kernels(self.source, self.precision)
+
+    def restart(self) -> None:
+        """Start the next episode, see `World.restart`; the bearings of the simulation have no noise."""
+        self.view("parameter_set")[:, BEARING_NOISE] = 0.0
+        super().restart()
+        if self.mask.numpy()[0] != 0:
+            self._detect(0, np.zeros_like(self.view("bearing")[0]), np.full_like(self.view("bearing_tick")[0], -1))
+
+    def advance(self, ticks: int) -> None:
+        """Run camera ticks, see `World.advance`; the detector runs before the observers of each."""
+        self._revive(ticks)
+        self.decide()
+        for _ in range(ticks):
+            self.sense()
+            self.launch.by_lane("follow", *self._follow(1))
+
+    def sense(self) -> None:
+        """Move the truth to the next tick, render its frames and detect their tags."""
+        tick, active = int(self.view("tick")[0]), self.mask.numpy()[0] == 0
+        before = self.view("bearing")[0].copy(), self.view("bearing_tick")[0].copy()
+        super().sense()
+        if active and tick < self.model.horizon_ticks:
+            self._detect(tick + 1, *before)
+
+    def _detect(self, tick: int, bearing: Array, bearing_tick: Array) -> None:
+        """Replace what is measured at a tick; targets without a detection keep their last `bearing` and its tick."""
+        sight, exact = self.view("sight")[0], self._pointed("bearing", 0)
+        visible = sight == Sight.VISIBLE
+        sight[visible] = Sight.MISSED
+        bearings, ticks = self.view("bearing")[0], self.view("bearing_tick")[0]
+        bearings[...], ticks[...] = bearing, bearing_tick
+        for vehicle in np.flatnonzero(visible.any(axis=-1)).tolist():
+            for target, ray in self._found(vehicle, tick, np.flatnonzero(visible[vehicle]), exact[vehicle]).items():
+                sight[vehicle, target], ticks[vehicle, target] = Sight.VISIBLE, tick
+                bearings[vehicle, target] = ray
+
+    def _found(self, vehicle: int, tick: int, visible: NDArray[Any], exact: Array) -> dict[int, Array]:
+        """Return the unit bearings (3,) by target that a detector finds where tags are along unit rays (T, 3).
+
+        Bearings are those of a camera without pan, see `coopenv.world.camera`.
+        """
+        images, camera, renderer = self.scenario.images, self._cameras[vehicle], self._renderers[vehicle]
+        drawn = [int(self.view(name)[0]) for name in ("seed", "episode")]
+        rng, noisy = np.random.default_rng([*drawn, tick, vehicle]), self._noisy[vehicle]
+        panned = camera.to_body().T @ camera.to_body(float(self.view("pan")[0, vehicle]))
+        places = exact @ panned * self._distances(vehicle)[:, None]
+        tags = [facing(target, places[target], images.side) for target in visible.tolist()]
+        frame = renderer.render(tags, images.blur, noisy * images.noise, rng)
+        targets, best = self.observer_init.setups[vehicle].targets, dict[int, Array]()
+        for tag in sorted(find_tags(frame, images.family, renderer.calibration), key=lambda tag: tag.size):
+            others = [target for target in targets if target != tag.number]
+            wrong = rng.random() < noisy * images.wrong_identity and others
+            number = int(rng.choice(others)) if wrong else tag.number
+            if tag.ray is not None and number in targets:
+                best[number] = panned @ tag.ray  # of a number the largest
+        return best
+
+    def _distances(self, vehicle: int) -> Array:
+        """Return how far the tags (T,) of all targets are from a vehicle's camera, m."""
+        R, position, own = self._copy("rotation", 0), self._copy("position", 0), self.model.landmarks + vehicle
+        tags = position + (R @ self.model.scene.marker.numpy().astype(float)[..., None])[..., 0]
+        lens = position[own] + R[own] @ self._cameras[vehicle].position
+        return np.asarray(np.linalg.norm(tags - lens, axis=-1))
+
+
+class Rendered(Simulated):
+    """A simulated world with rendered frames (`sensing = "images"`)."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Simulate a scenario. Raises CoopenvError: no OpenCV, or the family has too few tags."""
+        family, targets = scenario.images.family, len(scenario.target_names)
+        if (tags := len(dictionary_of(family).bytesList)) < targets:
+            raise CoopenvError(f"images.family: {family} has {tags} tags, the scenario has {targets} targets")
+        super().__init__(scenario)
+
+    def kind(self, *arguments: Any, **options: Any) -> RenderedWorld:
+        """Return the world; arguments and errors as for `RenderedWorld`."""
+        return RenderedWorld(*arguments, **options)

@@ -374,6 +374,7 @@ def check_differentiable(scenario: Scenario) -> None:
             (v2x.delay, v2x.period, v2x.loss, v2x.range, v2x.staleness) == (0, 1, 0.0, None, None)
         ),
         "camera.miss_probability must be 0": all(c.miss_probability == 0.0 for c in cameras),
+        "sensing must not be 'images'": scenario.sensing != "images",
         "camera.quantise must be false and camera.undistort true": all(c.undistort and not c.quantise for c in cameras),
         "dynamics.latency must be the same for every vehicle": len({limits.latency for limits in scenario.limits}) == 1,
         "observer.name must be 'riccati' with k = 1": observer.name == "riccati" and observer.k == 1.0,

@@ -115,8 +115,11 @@ def _targets(scenario: Scenario) -> str:
         "sensed": "sensed topology: what is in the field of view and not hidden is measured",
     }[scenario.topology.mode]
     if scenario.sensing != "sensed":
-        mode = {"ideal": "every neighbour is measured in every frame", "blind": "nothing is measured"}[scenario.sensing]
-        mode = f"{scenario.sensing} sensing: {mode}"
+        mode = {
+            "ideal": "ideal sensing: every neighbour is measured in every frame",
+            "blind": "blind sensing: nothing is measured",
+            "images": f"images: tags ({scenario.images.family}) are detected in rendered frames",
+        }[scenario.sensing]
     landmarks = _several(len(scenario.landmarks), "landmark") + (f" ({moving} moving)" if moving else "")
     buildings = scenario.obstacles and _several(len(scenario.obstacles), "building")
     return f"{_joined(', ', landmarks, len(scenario.vehicles) > 1 and 'other vehicles', buildings)}; {mode}"

@@ -1,5 +1,6 @@
 """The scenario: everything that defines a world, typed and checked; each failure is one line that names the field."""
 
+import math
 import re
 import warnings
 from collections import Counter
@@ -18,7 +19,7 @@ from coopenv.scenario.bodies import Landmark, LandmarkGroup, Obstacle, Road, Veh
 from coopenv.scenario.cosimulators import COSIMULATORS, Cosimulator, Highway, Program, Sumo
 from coopenv.scenario.learning import Action, Difficulty, Dynamics, Observation, Randomisation, Reward, Termination
 from coopenv.scenario.routes import Boxes, Route, followers, overlapping_pairs, possible_boxes, start_of
-from coopenv.scenario.sensing import Camera, Faults, Noise, ObserverSettings, Rates, Topology, V2x, rotation_of
+from coopenv.scenario.sensing import Camera, Faults, Images, Noise, ObserverSettings, Rates, Topology, V2x, rotation_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 MOST_TICKS = 1e8  # camera frames or odometry samples of one episode; counters are 32 bits wide
 
 MOST_PAIRS = 2e7  # of vehicles and their targets
+
+MOST_PIXELS = 2**21  # of a rendered frame
 
 FAR_FROM_ORIGIN = 50.0
 """m; beyond it the paper's observer loses accuracy, because it is not invariant to the map origin."""
@@ -79,10 +82,12 @@ class Scenario(Section, metaclass=_Loaded):
     rates: Rates = Rates()
     noise: Noise = Noise()
     topology: Topology = Topology()
-    sensing: Literal["sensed", "ideal", "blind"] = "sensed"
+    images: Images = Images()
+    sensing: Literal["sensed", "ideal", "blind", "images"] = "sensed"
     """Switch for studies of the value of sensing; all else stays equal, noise, radio and draws included.
     `ideal`: every neighbour is measured in every frame, regardless of field of view, range, misses and occluders;
-    `blind`: nothing is ever measured; `sensed`: by `topology.mode`."""
+    `blind`: nothing is ever measured; `sensed`: by `topology.mode`; `images`: likewise, with the bearings of a detector
+    in rendered frames, see `[images]`; `noise.bearing` is then an assumption of estimators alone."""
     v2x: V2x = V2x()
     faults: Faults = Faults()
     observer: ObserverSettings = ObserverSettings()
@@ -308,6 +313,7 @@ def _problems(s: Scenario) -> Iterator[str]:
     yield from _problems_of_draws(s)
     if s.topology.most_nearby is not None:
         yield from _problems_of_nearby(s)
+    yield from _problems_of_images(s)
     for name, rate in (("camera", s.rates.camera), ("odometry", s.rates.odometry)):
         if s.horizon * rate > MOST_TICKS:
             yield f"horizon: {s.horizon:g} s at rates.{name} = {rate:g} Hz are over {MOST_TICKS:.0e} samples"
@@ -338,6 +344,25 @@ def _problems_of_nearby(s: Scenario) -> Iterator[str]:
         yield f"v2x.range: needed with {key}"
     for i in [i for i, camera in enumerate(s.cameras) if camera.range is None][:1]:
         yield f"camera.range: needed with {key}, not there for vehicle_{i + 1}"
+
+
+def _problems_of_images(s: Scenario) -> Iterator[str]:
+    """Yield the conflicts of rendered frames with the rest of the scenario."""
+    if s.sensing != "images":
+        return
+    key, most = "sensing: 'images' needs", 16
+    if s.backend != "simulated":
+        yield f"{key} backend = 'simulated', got '{s.backend}'"
+    if s.topology.mode != "sensed" or s.topology.most_nearby is not None:
+        yield f"{key} topology.mode = 'sensed' without topology.most_nearby"
+    if len(s.vehicles) > most:
+        yield f"{key} at most {most} vehicles, got {len(s.vehicles)}"
+    for i, camera in enumerate(s.cameras):
+        own = f", not so for vehicle_{i + 1}"
+        if camera.model != "pinhole" or camera.quantise or not camera.undistort:
+            yield f"{key} camera.model = 'pinhole', quantise = false and undistort = true{own}"
+        if math.prod(camera.image_size) > MOST_PIXELS:
+            yield f"{key} camera.image_size of at most {MOST_PIXELS:,} pixels{own}"
 
 
 def _problems_of_driving(s: Scenario) -> Iterator[str]:

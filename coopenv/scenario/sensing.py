@@ -23,6 +23,7 @@ from coopenv.base.sections import (
     Rate,
     Sample,
     Section,
+    TagFamily,
     Vector2,
     Vector3,
 )
@@ -109,6 +110,23 @@ class Camera(Section):
     def is_misplaced(self) -> bool:
         """True if the true camera differs from the nominal one."""
         return any((self.extrinsics_error, self.extrinsics_position_error, self.focal_length_error))
+
+
+class Images(Section):
+    """Rendered frames of `sensing = "images"`. Landmarks and vehicles carry tags, upright and turned to the camera."""
+
+    family: TagFamily = "tag36h11"
+    """Family of the tags: `tag16h5` to `tag36h11` of AprilTag, `DICT_4X4_50` to `DICT_7X7_1000` of ArUco. Numbers are
+    those of the targets, landmarks first, from 0 on."""
+    side: Positive = 0.16
+    """Of the black squares, m."""
+    blur: Annotated[float, Field(ge=0.0, le=50.0)] = 0.5
+    """Standard deviation of the blur, pixels."""
+    noise: Annotated[float, Field(ge=0.0, le=255.0)] = 2.0
+    """Standard deviation of a pixel, shades: black and white are 190 apart."""
+    wrong_identity: Probability = 0.0
+    """Chance that a tag that is found is taken for that of another target of the vehicle, drawn per tag and frame. Lost
+    ones: `camera.miss_probability`."""
 
 
 class Rates(Section):

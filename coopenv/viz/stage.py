@@ -249,7 +249,7 @@ class Stage:
     def sees_a_part(self) -> bool:
         """True if a camera has a limited field of view that counts."""
         s = self.scenario
-        sensed = s.topology.mode == "sensed" and s.sensing == "sensed"
+        sensed = s.topology.mode == "sensed" and s.sensing in ("sensed", "images")
         return sensed and any(camera.model == "pinhole" for camera in s.cameras)
 
     def bodies(self, least: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

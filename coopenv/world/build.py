@@ -257,7 +257,7 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "obstacles": len(scenario.obstacles),
         "traffic": scenario.cosimulator.most_vehicles if scenario.cosimulator else 0,
         "sensed": scenario.topology.mode == "sensed",
-        "sensing": {"sensed": SENSED, "ideal": IDEAL, "blind": BLIND}[scenario.sensing],
+        "sensing": {"ideal": IDEAL, "blind": BLIND}.get(scenario.sensing, SENSED),
         "camera_rate": rates.camera,
         "odometry_rate": rates.odometry,
         "camera_period": 1.0 / rates.camera,

@@ -222,9 +222,7 @@ class World:
     def advance(self, ticks: int) -> None:
         """Run camera ticks under `self.actions`, stopping each world at its horizon; of one decision at most."""
         memory, hold = PerWorld(self.memory), PerWorld(self.mask)
-        if self.model.restarts == 1:
-            revive = observer_kernels(self.observer, self.precision)["revive"]
-            self._run(("revive", ticks), revive, memory, hold, ticks)
+        self._revive(ticks)
         sensing = self._world_kernels
         if self.launch.lanes > 1 or (self.in_parts and self.model.radio.delay == 0):
             self._advance_in_lanes(ticks)
@@ -236,6 +234,12 @@ class World:
             self.launch.decision(("advance", ticks), ticks, decide, self._sense(SENSE), *self._follow(1))
         if self.device == "cpu":  # reading from a GPU would wait for it
             self.check_room()
+
+    def _revive(self, ticks: int) -> None:
+        """Restart the observers whose restart falls into the next ticks."""
+        if self.model.restarts == 1:
+            revive = observer_kernels(self.observer, self.precision)["revive"]
+            self._run(("revive", ticks), revive, PerWorld(self.memory), PerWorld(self.mask), ticks)
 
     def _advance_in_lanes(self, ticks: int) -> None:
         """Run ticks of one decision; vehicles do not wait for each other but for messages of the same tick."""
