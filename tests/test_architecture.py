@@ -109,7 +109,7 @@ LINES_AND_FILES = {
     "world": (5623, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
-MOST_FILES = 242
+MOST_FILES = 243
 
 
 def test_wings_keep_their_budgets() -> None:
