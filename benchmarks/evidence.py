@@ -9,7 +9,9 @@ import argparse
 import sys
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +29,7 @@ from coopenv.bench.pages import table
 from coopenv.estimation.poses import Array
 from coopenv.observers import run
 from coopenv.observers.recording import Recording
+from coopenv.observers.robust import constants
 from coopenv.runs import record
 from coopenv.scenario import Scenario, load_scenario, parse_scenario
 
@@ -291,6 +294,34 @@ def levels(seeds: Sequence[int], jobs: int) -> str:
     return table(["error", "tracking", "road", "merging"], list(rows.values()))
 
 
+MASK_SCENES, MASKS = ("lane:20", "tree:20", "random:20,seed=3"), (64, 8)
+"""Scenes of 20 vehicles, and bits of the masks of `robust`: one for each vehicle, or shared by vehicles 8 apart."""
+
+
+def masks(seeds: Sequence[int], jobs: int) -> str:
+    """Return the table of shared bits in masks of vehicles: position RMSE (m) from 35 s on, over all vehicles."""
+    rows = []
+    for bits in MASKS:  # a process for each, because kernels are compiled with the number
+        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+            rows.append([str(bits), *pool.map(_masked, [(bits, scene, tuple(seeds)) for scene in MASK_SCENES])])
+    return table(["bits", *MASK_SCENES], rows)
+
+
+def _masked(given: tuple[int, str, Sequence[int]]) -> str:
+    bits, scene, seeds = given
+    constants.MASK_BITS = bits
+    overrides = {"observer.name": "robust", "horizon": HORIZON}
+    envs = coopenv.make_vec(scene, num_worlds=len(seeds), overrides=overrides, autoreset="disabled")
+    envs.reset(seed=min(seeds))
+    rate, errors = envs.scenario.rates.decision, []
+    for step in range(1, round(HORIZON * rate)):
+        envs.step(np.zeros(envs.action_space.shape, np.float32))
+        if step >= WINDOWS[-1] * rate:
+            errors.append(envs.engine.view("position_error").copy())
+    mean = np.sqrt(np.mean(np.square(errors), axis=(0, 2)))  # by world
+    return in_parentheses(float(mean.mean()), standard_error(mean))
+
+
 def _percent(true: NDArray[np.bool_]) -> str:
     return f"{100.0 * true.mean():.2g}"
 
@@ -304,6 +335,7 @@ PARTS: dict[str, Callable[[Sequence[int], int], str]] = {
     "undeclared": undeclared,
     "merging": merged,
     "levels": levels,
+    "masks": masks,
 }
 
 

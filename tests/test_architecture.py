@@ -93,7 +93,7 @@ def test_a_class_name_means_one_class() -> None:
 LINES_AND_FILES = {
     ".": (129, 2),
     "api": (4402, 19),
-    "backends": (4012, 15),
+    "backends": (4009, 15),
     "base": (1947, 10),
     "bench": (5512, 18),
     "cars": (11366, 43),

@@ -250,9 +250,6 @@ def _remarks_on(dataset: Dataset, tables: list[Rows]) -> list[str]:
     if outside:
         time = f"0 to {dataset.duration_s:.0f} s, in which there is odometry"
         remarks.append(f"{outside} of {total} detections left out: not within {time}")
-    found = {int(subject) for robot in dataset.robots for subject in robot.detections[:, 1]}
-    if unseen := [str(subject) for subject in dataset.landmarks if subject not in found]:
-        remarks.append(f"landmarks that were never detected: {', '.join(unseen)}")
     for robot in dataset.robots:
         if (misfit := _misfit(dataset, robot)) > MISFIT_DEG:
             off = f"bearings to landmarks are {misfit:.0f} deg off (median)"

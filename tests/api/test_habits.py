@@ -337,7 +337,7 @@ ABSENT: dict[str, tuple[Callable[[], Any], str]] = {
     "below": (lambda: coopenv.rollout, r"no attribute 'rollout' \(from coopenv\.runs import rollout\)$"),
     "a command": (lambda: coopenv.train, r"no attribute 'train' \(in the shell: coopenv train\)$"),
     "no command": (lambda: coopenv.main, r"no attribute 'main'; known: EVALUATION_SEEDS, "),
-    "nothing near": (lambda: coopenv.cuda, r"'cuda'; known: EVALUATION_SEEDS, .*, run$"),
+    "nothing near": (lambda: coopenv.cuda, r"'cuda'; known: EVALUATION_SEEDS, .*, sample_bags$"),
     "seed": (
         lambda: coopenv.parallel_env(ENV).seed(3),
         r"no attribute 'seed' \(did you mean 'reset'\?\); known: action_space,",

@@ -132,7 +132,6 @@ def test_actions_and_seeds_change_nothing(data: Path) -> None:
 def test_official_tests(data: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", "mrclam_6: landmarks that were never detected")
         parallel_api_test(coopenv.parallel_env("mrclam_6", data=data), num_cycles=200)
         parallel_api_test(replayed(simulated(FOUR_WAY), "mekf"), num_cycles=40)
     env = coopenv.parallel_env("mrclam_6", data=data)

@@ -89,7 +89,7 @@ OWN = {
     "reward.weights.control_again": 0.5,
     "observation.include": ["velocity_again", "odometry", "bearings", "bearing_again", "messages", "age_again"],
 }
-COPIES = {"velocity_again": "velocity", "bearing_again": "bearings", "age_again": "message_age"}
+COPIES = {"velocity_again": "velocity", "bearing_again": "bearing", "age_again": "message_age"}
 
 
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step"])

@@ -207,6 +207,6 @@ def test_dict_observations_drive_a_policy_with_several_inputs() -> None:
 def test_options_that_it_chooses_itself() -> None:
     with pytest.raises(coopenv.CoopenvError, match="chooses autoreset itself"):
         make_sb3_vec_env(FOUR_WAY, num_worlds=1, autoreset="disabled")
-    with pytest.raises(coopenv.CoopenvError, match=r"of a batch: CooperativeSB3VecEnv\(batch\)"):
+    with pytest.raises(coopenv.CoopenvError, match=r"for a batch: CooperativeSB3VecEnv\(batch\)"):
         make_sb3_vec_env(coopenv.make_vec(FOUR_WAY, num_worlds=1))  # type: ignore[arg-type]
     assert make_sb3_vec_env(FOUR_WAY, num_worlds=1, observer="robust").scenario.observer.name == "robust"
