@@ -244,7 +244,6 @@ def clear_entries(model: Any, state: Any, world: int, vehicle: int):
         clear_entry(state, world, vehicle, entry)
     for box in range(state.inbox_tick.shape[2]):
         clear_box(state, world, vehicle, box)
-    state.crowded[world, vehicle] = 0
     state.kept_count[world, vehicle] = 0
     if model.listed * model.kept > 0:
         state.kept_count[world, vehicle] = model.target_count[vehicle]
@@ -293,7 +292,7 @@ def place_of_farthest(model: Any, state: Any, world: int, vehicle: int, seen: An
 
 @device_function
 def keep(model: Any, state: Any, world: int, vehicle: int, agent: int, seen: Any):
-    """Keep an agent in range; a lack of room is noted until the next reset."""
+    """Keep an agent in range; a lack of room is noted until the next reset from the host."""
     if entry_of(model, state, world, vehicle, agent) >= 0:
         return
     count = state.kept_count[world, vehicle]

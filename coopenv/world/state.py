@@ -391,7 +391,7 @@ def state_struct(p: Precision) -> Any:
         kept_count: array("WN", wp.int32, whole(0, "kept"))  # agents that are kept, see `coopenv.world.nearby`
         kept_agent: array("WNV", wp.int32, KEPT_AGENT)  # of each entry; -1: none
         kept_order: array("WNV", wp.int32, KEPT_ORDER)  # entries in the order of their agents
-        crowded: array("WN", wp.int32, FLAG)  # 1: in this episode there was no room for an agent in range
+        crowded: array("WN", wp.int32, FLAG)  # 1: since `reset` there was no room for an agent in range
 
         first_item: array("WG", wp.int32, FIRST_ITEM)  # of each cell; scratch, like the next, see nearby.py
         next_item: array("WI", wp.int32, NEXT_ITEM)  # in the same cell; -1: none

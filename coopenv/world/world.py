@@ -192,6 +192,7 @@ class World:
         """
         if self.device != "cpu":
             self.check_room()
+        self.state.crowded.zero_()  # restarts on the device keep it
         chosen = np.ones(self.worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
         if keys is not None:
             wanted = np.array([int(key or 0) % 2**64 for key in keys], dtype=np.uint64)
@@ -306,7 +307,7 @@ class World:
         self.launch("arrange", arrange, [*arguments, 0, 1], (1,))
 
     def check_room(self) -> None:
-        """Check that all vehicles have kept all agents in range in this episode; a reset warns of it on a GPU.
+        """Check that all vehicles have kept all agents in range since the last reset; on a GPU the next reset warns.
 
         Raises:
             CoopenvError: the scenario's limit is too low.

@@ -108,6 +108,9 @@ def test_too_many_in_range_are_one_line() -> None:
         now = world.view("crowded") > 0
         assert crowded.any() and now[crowded].all()  # until the next reset
         crowded = now
+    world.mask.fill_(1)
+    world.restart()  # as an automatic restart on the device
+    assert (world.view("crowded") > 0)[crowded].all()
     with pytest.warns(ScenarioWarning, match=r"more than 5 targets and senders are in range of vehicle_\d+ in world 0"):
         world.reset([0])
 

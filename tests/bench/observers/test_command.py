@@ -76,7 +76,7 @@ def comparison_of_two() -> coopenv.Comparison:
 
 def test_json_and_csv(folder: Path) -> None:
     board = json.loads((folder / "leaderboard.json").read_text())
-    assert set(board) == {"command", "versions", "seeds", "rows", "windows", "basin"}
+    assert set(board) == {"command", "versions", "seeds", "standard_errors_over", "rows", "windows", "basin"}
     assert set(board["versions"]) == {"coopenv", "numpy", "scipy", "warp-lang", "python"} and board["seeds"] == [0, 1]
     assert list(board["rows"][0]) == [f.name for f in fields(Row)] and set(board["rows"][0]) >= REQUIRED
     keys = [(row["variant"], row["observer"], row["vehicle"]) for row in board["rows"]]
