@@ -50,7 +50,7 @@ def _throughput(results: dict[str, dict[str, Any]]) -> str:
         case, memory = name.split(", ")[1], f"{result['bytes_per_world'] / 1024:.0f}"
         row = rows.setdefault(case, [case, memory, *[""] * len(sizes)])
         row[2 + sizes.index(result["worlds"])] = _rate(result["vehicle_ticks_per_s"])
-    columns = ("vehicle ticks/s", "KiB/world", *(f"{size:,} worlds" for size in sizes))
+    columns = ("vehicle ticks/s", "KiB/world", *(f"{size:,} world{'s' * (size > 1)}" for size in sizes))
     return table(columns, list(rows.values())) if rows else ""
 
 

@@ -171,7 +171,7 @@ def test_the_whole_run_on_a_cpu(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert results["agreement, robust"]["worlds_alike"] == results["agreement, robust"]["worlds"]
     assert results["throughput, riccati, 64"]["env_steps_per_s"] > 0.0
     assert results["tests"]["failed"] == 0 < results["tests"]["passed"]
-    assert "| vehicle ticks/s | KiB/world | 64 worlds |" in capsys.readouterr().out
+    assert "| vehicle ticks/s | KiB/world | 1 world | 64 worlds |" in capsys.readouterr().out
 
 
 def test_rounds_alternate() -> None:
