@@ -199,7 +199,7 @@ class Yard:
 @pytest.fixture
 def yard(monkeypatch: pytest.MonkeyPatch) -> Yard:
     made = Yard()
-    monkeypatch.setattr("coopenv.cars.backend.station.time", Ticking(made.tell))
+    monkeypatch.setattr("coopenv.cars.backend.station.time", Ticking(made.publish))
     return made
 
 
@@ -341,7 +341,7 @@ def test_a_network_that_fails_does_not_end_the_watchdog(
         patch.setattr(yard.gates, "stop", broken)
         dog.arm()  # nothing has ever been heard of the wheels
         wait_until(lambda: len(calls) > 2)
-    wait_until(lambda: states(yard) == ["stopped", "stopped"], yard.tell)
+    wait_until(lambda: states(yard) == ["stopped", "stopped"], yard.publish)
     dog.forget()
     dog.arm()
 
