@@ -8,7 +8,8 @@ FROM python:3.11-slim
 ENV PYTHONUNBUFFERED=1 PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 MPLBACKEND=Agg WARP_CACHE_PATH=/home/coopenv/.warp
 
 COPY . /src
-RUN pip install --constraint /src/constraints.txt '/src[log,video,view]' && rm -rf /src
+# kernels are compiled here, because containers keep no cache
+RUN pip install --constraint /src/constraints.txt '/src[log,video,view]' && python /src/benchmarks/kernels.py && rm -rf /src
 
 RUN useradd --uid 1000 --create-home coopenv && mkdir /home/coopenv/out && chown coopenv /home/coopenv/out
 USER coopenv
