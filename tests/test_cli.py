@@ -97,7 +97,8 @@ def test_describe_says_what_matters_on_one_screen(name: str, capsys: pytest.Capt
     out = capsys.readouterr().out
     assert len(out.splitlines()) <= 24
     assert max(len(line.rstrip()) for line in out.splitlines()) <= 80
-    size = coopenv.parallel_env(name).observation_space("vehicle_1").shape[0]
+    env = coopenv.parallel_env(name)
+    size = env.observation_space(env.possible_agents[0]).shape[0]
     assert f"Observation  {size} numbers per vehicle" in out
     assert environment_id(name) in out
 

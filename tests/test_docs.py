@@ -186,7 +186,7 @@ def test_the_page_on_highway(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("highway_env", reason="needs the extra 'highway'")
     roundabout, estimates = run(DOCS / "highway.md")
     assert not roundabout["env"].agents and np.isfinite(estimates["info"]["localisation"]["position_error"])
-    assert "vehicle_1" in capsys.readouterr().out
+    assert "vehicle_4" in capsys.readouterr().out
     (text,) = tables("highway.md")
     raw = {"title": "highway", "horizon": 1.0, "landmarks": [{"name": "a", "position": [1.0, 1.0, 1.0]}]}
     assert parse_scenario(raw | tomllib.loads(text), "highway.md").backend == "highway"

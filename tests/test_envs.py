@@ -50,7 +50,7 @@ def test_rendering(drawn: str) -> None:
 def test_registries(name: str) -> None:
     identity = environment_id(name)
     parallel = pettingzoo.make("parallel", identity)
-    assert parallel.possible_agents == SHIPPED[name].vehicle_names
+    assert parallel.possible_agents == [SHIPPED[name].vehicle_names[i] for i in SHIPPED[name].agents()]
     assert parallel.metadata["name"] == f"{name}_v0"
     short = pettingzoo.make("parallel", identity, max_cycles=7).scenario
     assert short.horizon_ticks == 7 * short.ticks_per_decision

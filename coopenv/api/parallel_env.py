@@ -46,7 +46,10 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
 
     Action (per agent): Box(-1, 1, (2,), float32): speed or acceleration, and steering (positive: left); with
     `[action.pan]` a third entry, the angle of the camera. Values beyond
-    are clipped. Vehicles with prescribed motion ignore it.
+    are clipped.
+
+    Agents are the vehicles that actions drive. Where all motion is prescribed, every vehicle is an agent whose actions
+    have no effect.
 
     Reward: the weighted sum of the named terms in `info["reward_terms"]`, or what a function in Python returns.
 
@@ -82,10 +85,8 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
             "is_parallelizable": True,
         }
         self.engine = Engine(scenario, 1, dtype, device, backend=backend, reward=reward)
-        here = backend.capabilities.estimated
         names = scenario.vehicle_names
-        drivers = scenario.drivers
-        self.possible_agents = [n for i, n in enumerate(names) if drivers[i] is None and (here is None or i in here)]
+        self.possible_agents = [names[i] for i in scenario.agents(backend.capabilities.estimated)]
         if not self.possible_agents:
             raise CoopenvError("vehicles.*.motion.driver: every vehicle has a driver, no agent is left")
         self._agents: list[str] = []

@@ -64,8 +64,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         self._spec: EnvSpec | None = None
         self.world: CooperativeLocalisationEnv = parallel_env(name_or_path, **options)
         names, scenario = self.world.possible_agents, self.world.scenario
-        acting = [n for n, acts in zip(scenario.vehicle_names, scenario.acting, strict=True) if acts and n in names]
-        self.vehicle = (acting or names)[-1] if vehicle is None else vehicle
+        self.vehicle = names[-1] if vehicle is None else vehicle
         check_one_of("unknown vehicle", self.vehicle, names)
         self._others = driver_of(others, scenario)
         self.render_mode, self.scenario = self.world.render_mode, scenario

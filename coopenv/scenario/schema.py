@@ -4,7 +4,7 @@ import math
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterator, KeysView, Mapping, Sequence
+from collections.abc import Collection, Iterator, KeysView, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -177,6 +177,14 @@ class Scenario(Section, metaclass=_Loaded):
         """For each vehicle, True if actions drive it."""
         driven = [vehicle.motion.kind == "driven" for vehicle in self.vehicles]
         return [each and driver is None for each, driver in zip(driven, self.drivers, strict=True)]
+
+    def agents(self, estimated: Collection[int] | None = None) -> list[int]:
+        """Return indices of the vehicles that actions drive, or without any of all that have no driver.
+
+        `estimated` are the indices to choose from (None: all).
+        """
+        free = [i for i, driver in enumerate(self.drivers) if driver is None and (estimated is None or i in estimated)]
+        return [i for i in free if self.acting[i]] or free
 
     @property
     def action_size(self) -> int:

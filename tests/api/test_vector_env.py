@@ -41,11 +41,12 @@ def test_single_world_is_world_0_bit_for_bit(name: str, dtype: str) -> None:
     batch = coopenv.make_vec(name, num_worlds=3, dtype=dtype, autoreset="disabled")
     rng = np.random.default_rng(0)
     observations, _ = batch.reset(seed=40)
-    singles = [coopenv.parallel_env(name, dtype=dtype) for _ in range(3)]
+    singles, names = [coopenv.parallel_env(name, dtype=dtype) for _ in range(3)], batch.scenario.vehicle_names
     for world, single in enumerate(singles):
         first, _ = single.reset(seed=40, options={"world": world})
-        there = batch.engine.view("alive")[world]
-        assert list(first) == [agent for agent, alive in zip(single.possible_agents, there, strict=True) if alive]
+        alive = batch.engine.view("alive")[world]
+        there = [i for i in batch.scenario.agents() if alive[i]]
+        assert list(first) == [names[i] for i in there]
         assert np.array_equal(batch.world_major(observations)[world][there], np.stack(list(first.values())))
     slow = batch.scenario.backend != "simulated"  # cars are stepped on the host
     for _ in range(4 if slow else 20):
@@ -55,9 +56,9 @@ def test_single_world_is_world_0_bit_for_bit(name: str, dtype: str) -> None:
         assert terminated.dtype == truncated.dtype == bool
         for world, single in enumerate(singles):
             alive = list(single.agents)
-            results = single.step({agent: actions[world, single.possible_agents.index(agent)] for agent in alive})
+            results = single.step({agent: actions[world, names.index(agent)] for agent in alive})
             for agent in alive:
-                row = world * batch.vehicles + single.possible_agents.index(agent)
+                row = world * batch.vehicles + names.index(agent)
                 assert np.array_equal(observations[row], results[0][agent])
                 assert rewards[row] == np.float32(results[1][agent])
                 assert (terminated[row], truncated[row]) == (results[2][agent], results[3][agent])

@@ -68,10 +68,10 @@ def test_a_program_moves_what_it_does_not_leave_to_actions(own: dict[str, Any]) 
     env.reset(seed=0)
     for k in range(1, 12):
         *_, infos = env.step({agent: np.array([1.0, 0.0]) for agent in env.agents})
-        place = infos["vehicle_1"]["truth"]["position"]
-        assert place[:2] == pytest.approx([5.0 * np.cos(0.05 * k), 5.0 * np.sin(0.05 * k)])
-        assert infos["vehicle_1"]["position_error"] < 1e-9  # its odometry is that of an arc
-    assert infos["vehicle_2"]["truth"]["position"][0] > 0.3 and infos["vehicle_2"]["position_error"] < 0.01
+        place = infos["vehicle_2"]["truth"]["position"]
+        assert env.engine.view("position")[0, -2, :2] == pytest.approx([5.0 * np.cos(0.05 * k), 5.0 * np.sin(0.05 * k)])
+        assert env.engine.view("position_error")[0, 0] < 1e-9  # its odometry is that of an arc
+    assert env.possible_agents == ["vehicle_2"] and place[0] > 0.3 and infos["vehicle_2"]["position_error"] < 0.01
     assert env.engine.view("traffic_half")[0].tolist() == [[1.0, 1.0, 1.0]]
     twin = coopenv.parallel_env(env.scenario, dtype="float64")
     twin.reset(seed=5)

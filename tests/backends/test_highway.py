@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 import coopenv
 from coopenv import CoopenvError
 from coopenv.api.engine import Engine
-from coopenv.estimation import Sight
+from coopenv.estimation import Outcome, Sight
 
 pytest.importorskip("highway_env", reason="needs the extra highway")
 
@@ -88,12 +88,20 @@ def test_commands_are_speeds_and_steering_to_the_left() -> None:
 def test_traffic_ignores_commands() -> None:
     moved = []
     for action in (-1.0, 1.0):
-        env = coopenv.parallel_env(ROUNDABOUT, dtype="float64")
-        env.reset(seed=4)
+        engine = engine_of(ROUNDABOUT)
+        engine.reset([4])
         for _ in range(5):
-            *_, infos = env.step({a: np.array([0.0, 0.0] if a == "vehicle_4" else [action] * 2) for a in env.agents})
-        moved.append([infos[f"vehicle_{i}"]["truth"]["position"] for i in (1, 2, 3)])
+            engine.step(np.array([[[action] * 2] * 3 + [[0.0, 0.0]]]))
+        moved.append(engine.view("position")[0, -4:].copy())
     assert_allclose(*moved)
+
+
+def test_traffic_has_no_actions() -> None:
+    env = coopenv.parallel_env(ROUNDABOUT)
+    observations, _ = env.reset(seed=4)
+    assert env.possible_agents == env.agents == [*observations] == ["vehicle_4"]
+    with pytest.raises(CoopenvError, match="action for unknown agent 'vehicle_1'"):
+        env.step(dict.fromkeys(("vehicle_1", "vehicle_4"), np.zeros(2)))
 
 
 @pytest.mark.parametrize("name", [CROSSING, ROUNDABOUT])
@@ -166,19 +174,13 @@ def test_to_touch_other_traffic_is_a_collision() -> None:
 
 
 def test_who_leaves_the_road_has_arrived() -> None:
-    env = coopenv.parallel_env(
-        CROSSING,
-        overrides={
-            "horizon": 40.0,
-            "vehicles": [{"motion": {"kind": "driven"}}] + [{"motion": {"kind": "traffic"}}] * 2,
-        },
-    )
-    env.reset(seed=3)
-    arrived: list[str] = []
-    while env.agents and not arrived:
-        *_, infos = env.step({agent: np.array([-1.0, 0.0]) for agent in env.agents})
-        arrived = [agent for agent, info in infos.items() if info["outcome"] == "arrived"]
-    assert arrived and "vehicle_1" not in arrived
+    vehicles = [{"motion": {"kind": "driven"}}] + [{"motion": {"kind": "traffic"}}] * 2
+    engine = engine_of(CROSSING, horizon=40.0, vehicles=vehicles)
+    engine.reset([3])
+    engine.set_actions(np.full((1, 3, 2), [-1.0, 0.0]))
+    while not (arrived := engine.view("ended")[0] == Outcome.ARRIVED).any():
+        engine.step()
+    assert not arrived[0]
 
 
 def test_a_plain_environment_in_the_same_program_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -300,7 +302,7 @@ def test_its_way_can_be_driven_by_what_is_observed(name: str, speed: float, seed
     top, widest = env.scenario.dynamics.max_speed, env.scenario.action.steering
     assert widest is not None
     place = next(i for i, vehicle in enumerate(env.scenario.vehicles) if vehicle.motion.kind == "driven")
-    driver = env.possible_agents[place]
+    driver = f"vehicle_{place + 1}"
     observations, infos = env.reset(seed=seed)
     offset = []
     while driver in env.agents:

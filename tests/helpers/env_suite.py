@@ -94,7 +94,8 @@ def rendering(make: Make) -> None:
 @check
 def agent_names(make: Make) -> None:
     env = make()
-    assert env.possible_agents == [f"vehicle_{i + 1}" for i in range(len(env.possible_agents))]
+    acting = [f"vehicle_{i + 1}" for i, acts in enumerate(env.scenario.acting) if acts]
+    assert env.possible_agents == (acting or env.scenario.vehicle_names)
     assert all(re.fullmatch("[a-z]+_[0-9]+", agent) for agent in env.possible_agents)
     for agent in env.possible_agents:
         assert env.observation_space(agent) is env.observation_space(agent)
@@ -131,7 +132,7 @@ def flat_and_dict_hold_the_same(make: Make) -> None:
 @check
 def layout_covers_the_observation_once(make: Make) -> None:
     env = make()
-    covered = np.zeros(env.observation_space("vehicle_1").shape, dtype=int)
+    covered = np.zeros(env.observation_space(env.possible_agents[0]).shape, dtype=int)
     for field in env.observation_layout.values():
         covered[field.slice] += 1
         assert field.stop - field.start == int(np.prod(field.shape))
@@ -142,7 +143,7 @@ def layout_covers_the_observation_once(make: Make) -> None:
 def infos(make: Make) -> None:
     env = make(dtype="float64")
     steps = rollout(env, 5, STEPS)
-    keys = set(steps[0][1]["vehicle_1"])
+    keys = set(next(iter(steps[0][1].values())))
     weights = env.scenario.reward.weights.model_dump()
     for step in steps:
         for agent, info in step[-1].items():

@@ -47,14 +47,14 @@ def test_recorded_ticks_equal_the_environment_stepped_by_decisions(name: str, ov
     run = rollout(scenario, seed=7, policy=lambda observations: next(given))
     env = coopenv.parallel_env(name, dtype="float64", overrides=overrides)
     env.reset(seed=7)
-    tick = 0
+    tick, names = 0, scenario.vehicle_names
     for action in actions:
         if not env.agents:
             break
-        *_, infos = env.step({agent: action[env.possible_agents.index(agent)] for agent in env.agents})
+        *_, infos = env.step({agent: action[names.index(agent)] for agent in env.agents})
         tick = min(tick + scenario.ticks_per_decision, scenario.horizon_ticks)
         for agent, info in infos.items():
-            i = env.possible_agents.index(agent)
+            i = names.index(agent)
             assert np.array_equal(info["truth"]["position"], run.position[tick, i])
             assert np.array_equal(info["truth"]["rotation"], run.rotation[tick, i])
             assert np.array_equal(info["estimate"]["position"], run.position_estimate[tick, i])

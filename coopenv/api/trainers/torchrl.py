@@ -27,7 +27,7 @@ EVENTS = {"arrived": Outcome.ARRIVED, "collided": Outcome.COLLIDED}
 
 
 class BatchedWorlds(EnvBase):
-    """W worlds, batch size (W,), with their N vehicles as the group `vehicle`, and `state` (W, S) for central critics.
+    """W worlds, batch size (W,), with their N agents as the group `vehicle`, and `state` (W, S) for central critics.
 
     - `vehicle`: `observation`, `reward`, `info` (errors in m and deg, NEES, 1 in the step of an arrival or collision),
       and `mask`, true for vehicles under way (with a team reward, of the team): those that act. Other rows are 0, and
@@ -36,7 +36,7 @@ class BatchedWorlds(EnvBase):
     - A world is `done` when all of its vehicles are, and `terminated` if all of them are. TorchRL then resets it by
       `_reset`, (W, 1), alone.
 
-    Vehicles with scripted drivers are no agents. `set_seed` fixes the episodes from the next reset of all worlds on.
+    Agents are those of `coopenv.parallel_env`. `set_seed` fixes the episodes from the next reset of all worlds on.
     """
 
     def __init__(self, batch: CooperativeVectorEnv) -> None:
@@ -45,9 +45,7 @@ class BatchedWorlds(EnvBase):
         super().__init__(device=batch.engine.world.device, batch_size=[worlds])
         self.batch, self.scenario = batch, scenario
         self._seed: int | None = None
-        self._agents = [i for i, driver in enumerate(scenario.drivers) if driver is None]
-        acting = [scenario.acting[i] for i in self._agents]
-        self._acts = torch.tensor(acting, device=self.device) | (not any(acting))  # any, where none does
+        self._agents = scenario.agents()
         self.group_map = {GROUP: [scenario.vehicle_names[i] for i in self._agents]}
         rows = (worlds, len(self._agents))
         self._going = torch.zeros(rows, dtype=torch.bool, device=self.device)
@@ -116,7 +114,7 @@ class BatchedWorlds(EnvBase):
         info |= {name: (fresh & (ended == code)).float() for name, code in EVENTS.items()}
         group = {
             "observation": torch.where(acted[..., None], self._field("observation"), 0.0),
-            "mask": self._going & self._acts,
+            "mask": self._going,
             "info": TensorDict({name: torch.where(acted, each, 0.0) for name, each in info.items()}, acted.shape),
             **flags,
         }
