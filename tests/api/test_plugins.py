@@ -126,6 +126,21 @@ def test_the_environment_and_the_runner_agree(name: str) -> None:
     assert result.coordinates is not Coordinates.RICCATI and not result.failure
 
 
+def test_joint_observers_correct_both_driven_cars_by_the_bearing_between_them() -> None:
+    """The first of two cars measures nothing, the second the first."""
+    overrides = {"horizon": 2.0, "vehicles.vehicle_1.neighbours": [], "vehicles.vehicle_2.neighbours": ["vehicle_1"]}
+    std = {}
+    for name in ("dead_reckoning", "covariance_intersection", "centralised"):
+        env = coopenv.parallel_env("scout_platoon", observer=name, dtype="float64", overrides=overrides)
+        env.reset(seed=0)
+        while env.agents:
+            infos = env.step(still(env))[4]
+        P = [infos[f"vehicle_{i}"]["estimate"]["covariance"][3:, 3:] for i in (1, 2)]
+        std[name] = np.sqrt(np.trace(P, axis1=1, axis2=2))
+    assert_allclose(std["covariance_intersection"][0], std["dead_reckoning"][0], rtol=1e-3)
+    assert (std["centralised"] < 0.8 * std["dead_reckoning"]).all()
+
+
 class Silent(DeadReckoning):
     """States no covariance."""
 
