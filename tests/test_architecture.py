@@ -96,17 +96,17 @@ LINES_AND_FILES = {
     "backends": (4009, 15),
     "base": (1947, 10),
     "bench": (5512, 18),
-    "cars": (11366, 43),
+    "cars": (11368, 43),
     "cli": (2719, 9),
     "estimation": (1917, 7),
     "evaluation": (492, 3),
     "observers": (11875, 42),
     "policies": (2077, 10),
-    "runs": (3572, 13),
-    "scenario": (3820, 12),
+    "runs": (3573, 13),
+    "scenario": (3822, 12),
     "training": (1612, 6),
     "viz": (4887, 16),
-    "world": (5623, 18),
+    "world": (5626, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 MOST_FILES = 243

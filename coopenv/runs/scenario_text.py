@@ -153,7 +153,8 @@ def vehicle_motion(vehicle: Vehicle) -> str:
     place = f"the end of its route: {' or '.join(vehicle.routes)}" if vehicle.routes else ""
     if not place and vehicle.goal is not None and vehicle.goal.position is not None:
         place = vector(vehicle.goal.position)
-    return lines(motion(vehicle.motion), place and f"goal: within {number(vehicle.goal_radius)} m of {place}")
+    goal = place and f"goal: within {number(vehicle.goal_radius)} m of {place}"
+    return lines(motion(vehicle.motion), goal, not vehicle.connected and "without a radio")
 
 
 def size(edges: Sequence[float]) -> str:

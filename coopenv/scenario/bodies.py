@@ -244,7 +244,7 @@ class Landmark(Section):
 
 
 class Vehicle(Section):
-    """A connected vehicle that estimates its own pose; named vehicle_1, vehicle_2, ... in file order."""
+    """A vehicle that estimates its own pose; named vehicle_1, vehicle_2, ... in file order."""
 
     initial_pose: InitialPose | None = None
     """Needed unless the motion is by waypoints, which start at the first waypoint, the vehicle has routes, or
@@ -263,6 +263,8 @@ class Vehicle(Section):
     other vehicle is near."""
     next_routes: tuple[str, ...] = Field(default=(), max_length=1000)
     """Routes that may follow its routes where `termination.after_arrival` is `continue` or `transit` (default: all)."""
+    connected: bool = True
+    """Whether it has a V2X radio. Without one it neither sends nor receives; cameras measure it all the same."""
     neighbours: tuple[str, ...] | None = None
     """Targets it may measure: landmark names and vehicle names (default: every landmark and every leader)."""
     goal: Goal | None = None

@@ -394,6 +394,7 @@ def _cells(scenario: Scenario) -> dict[str, Any]:
 
 def _radio(scenario: Scenario) -> dict[str, Any]:
     return {
+        "connected": [vehicle.connected for vehicle in scenario.vehicles],
         "entry": (2 if scenario.action.pan is None else 3) if scenario.action.radio else 0,
         "to_all": scenario.v2x.links == "all",
         "slots": max(scenario.v2x.delay, 1) + 1 + scenario.replay_ticks,

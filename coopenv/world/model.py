@@ -257,6 +257,7 @@ def model_struct(p: Precision) -> Any:
     class Radio:
         """V2X."""
 
+        connected: wp.array(dtype=wp.int32)  # (N,) whether a vehicle has a radio
         entry: wp.int32  # place of an action's first number for the radio; 0: everything is broadcast
         to_all: wp.int32  # 1: messages reach all vehicles, not only vehicles that may measure their sender
         delay: wp.int32  # ticks

@@ -275,11 +275,12 @@ def start_covariance(model: Any, state: Any, world: int, vehicle: int):
 def broadcast(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Broadcast a vehicle's estimate (Rhat, Rhat phat), and when it last measured each vehicle.
 
-    It does so if a message is due and the vehicle is present.
+    It does so if a message is due and the vehicle is present and has a radio.
     """
     slot = tick % model.radio.slots
     sent = int(-1)
-    if tick % model.radio.period == 0 and state.present[world, model.landmarks + vehicle] != 0:
+    sends = state.present[world, model.landmarks + vehicle] != 0 and model.radio.connected[vehicle] != 0
+    if tick % model.radio.period == 0 and sends:
         sent = tick
         R = state.estimate_rotation[world, vehicle]
         position = R * state.estimate_position[world, vehicle]
@@ -356,7 +357,7 @@ def transmit(model: Any, state: Any, world: int, receiver: int, tick: int):
     here = state.position[world, model.landmarks + receiver]
     for box in range(state.arriving.shape[2]):
         state.arriving[world, receiver, box] = -1
-    if is_jammed(model, state, world, here, tick):
+    if model.radio.connected[receiver] == 0 or is_jammed(model, state, world, here, tick):
         return
     kept = model.kept
     every = model.radio.to_all == 1 and kept == 0

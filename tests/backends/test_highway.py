@@ -162,6 +162,23 @@ def test_other_traffic_hides_what_is_behind_it() -> None:
     assert seen == [Sight.VISIBLE, Sight.OCCLUDED_BY_BODY]
 
 
+def test_unconnected_traffic_is_measured_and_sends_nothing() -> None:
+    """What cameras measure, and what the cars hide, is the same as with a radio."""
+    given = {"camera.model": "omnidirectional", "camera.range": 300.0, "camera.miss_probability": 0.0, "obstacles": []}
+    given["observation.include"] = ["sightings", "messages"]
+    sight = []
+    for connected in (True, False):
+        overrides = {**given, "vehicles.vehicle_1.connected": connected}
+        engine = Engine(coopenv.load_scenario(ROUNDABOUT, overrides), 1, "float64")
+        engine.reset([1])
+        engine.step(np.zeros((1, 4, 2)))
+        sight.append(engine.view("sight")[0, 3].copy())
+    assert np.array_equal(*sight) and sight[0][-4] == Sight.VISIBLE
+    row = {name: engine.view("observation")[0, 3, field.slice] for name, field in engine.layout.items()}
+    assert row["sighting_mask"][0] == 1.0 and np.linalg.norm(row["sighting"][:3]) == pytest.approx(1.0)
+    assert row["message_mask"].tolist() == [0.0, 1.0, 1.0]
+
+
 def test_to_touch_other_traffic_is_a_collision() -> None:
     engine = engine_of(ROUNDABOUT, highway__most_vehicles=40)
     engine.reset([1])

@@ -131,6 +131,19 @@ def test_radio_range() -> None:
     assert heard == [*range(62), *[61] * 59]  # 1 m + 61/60 m is the last within 2.02 m
 
 
+def test_a_vehicle_without_a_radio_is_measured_and_neither_sends_nor_receives() -> None:
+    """The last of three leaders, and a follower without a radio: what the others exchange stays as it is."""
+    made, every = circling(initial_estimate=ESTIMATE), start(fleet())
+    made[1]["connected"] = False
+    silent, connected = run(start(scenario(made)), 30), run(every, 30)
+    for now, then in zip(silent, connected, strict=True):
+        assert (now["inbox_tick"][0, 1] == -1).all() and (now["inbox_tick"][0, :, 1] == -1).all()
+        assert now["inbox_tick"][0, 2, 0] == then["inbox_tick"][0, 2, 0] >= 0
+        assert np.array_equal(now["bearing"], then["bearing"]) and np.array_equal(now["sight"], then["sight"])
+    assert silent[-1]["bytes_sent"][0, 1] == 0 < silent[-1]["bytes_sent"][0, 0]
+    assert not np.array_equal(silent[-1]["estimate_position"][0, 2], connected[-1]["estimate_position"][0, 2])
+
+
 @pytest.mark.parametrize("staleness", [None, 0.05, 0.1])
 def test_stale_messages_are_not_used(staleness: float | None) -> None:
     """With one message per second, the leader's bearing shrinks P only while the message is young enough."""

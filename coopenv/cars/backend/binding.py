@@ -81,6 +81,8 @@ def bind(
             f"{where}: cars: {len(driven)} of them are vehicles, the environment has {len(vehicles)}: "
             f"{listed(vehicles)}"
         )
+    for i in [i for i, vehicle in enumerate(scenario.vehicles) if not vehicle.connected][:1]:
+        raise CoopenvError(f"{where}: vehicles.{i}.connected: must be true, cars send their estimates")
     left = [name for name in vehicles if name not in {car.vehicle for car in driven}]
     targets = {number: _index(landmarks, name, f"{where}: markers") for name, number in markers.items()}
     chosen, led = {}, {}

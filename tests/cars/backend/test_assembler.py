@@ -351,6 +351,11 @@ def test_who_is_not_there_is_named(fleet: list[Car], markers: dict[str, int], wh
     assert str(caught.value).startswith("lab.toml: ") and why in str(caught.value)
 
 
+def test_a_vehicle_without_a_radio_is_refused() -> None:
+    with pytest.raises(CoopenvError, match=r"^lab\.toml: vehicles\.0\.connected: must be true, cars send"):
+        bind(scenario([vehicle(connected=False)]), [Car(name="a")], {}, "lab.toml", None)
+
+
 def test_a_camera_without_calibration_is_refused() -> None:
     with pytest.raises(CoopenvError, match="the camera of vehicle_1 has no calibration"):
         binding(camera={"model": "omnidirectional"})
