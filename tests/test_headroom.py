@@ -112,12 +112,16 @@ def test_cooperation_costs_the_helpers_and_pays_for_the_fleet(environment: str) 
         assert honest <= 0.5 * dependent_e95(own, environment)
 
 
+CLONES = {"lighthouse": 1.15, "take_turns": 1.15, "liar_among_us": 1.15, "scout_platoon": 1.4}
+"""Largest ratio of a clone's e95 to that of the team planner."""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("environment", ["lighthouse", "take_turns", "liar_among_us"])
+@pytest.mark.parametrize("environment", CLONES)
 def test_cooperation_is_learnt_from_what_each_vehicle_observes(environment: str) -> None:
     agents = ("look_ahead", "team_look_ahead", f"{environment}_team")
     selfish, team, learned = (team_episodes(environment, agent, "as it is")[1] for agent in agents)
-    assert learned["e95_m"][0] <= 1.15 * team["e95_m"][0] and learned["e95_m"][2] < selfish["e95_m"][1]
+    assert learned["e95_m"][0] <= CLONES[environment] * team["e95_m"][0] and learned["e95_m"][2] < selfish["e95_m"][1]
     often = team_episodes(environment, f"{environment}_team", "as it is", 256)[1]  # one crash in 32 worlds is over 1 %
     assert often["arrival_rate"][0] >= 0.97 and often["collision_rate"][0] < 0.01
     unseen = [dependent_e95(team_episodes(environment, agent, "cars unseen")[0], environment) for agent in agents]
