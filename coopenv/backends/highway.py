@@ -123,7 +123,7 @@ def __getattr__(name: str) -> Any:
     from highway_env.vehicle.behavior import IDMVehicle
 
     own = {"DISTANCE_WANTED": 5.0 + IDMVehicle.LENGTH, "COMFORT_ACC_MAX": 3.0, "COMFORT_ACC_MIN": -5.0}  # m, m/s^2
-    globals()[name] = type(name, (IDMVehicle,), own if name == "Traffic" else {})
+    globals()[name] = type(name, (IDMVehicle,), {"__module__": __name__, **(own if name == "Traffic" else {})})
     return globals()[name]
 
 
