@@ -262,9 +262,14 @@ def without_robots(scenario: Any, kept: Sequence[int]) -> Any:
         return scenario.model_copy(update={"vehicles": tuple(vehicles)})
 
 
+def has_faults(recording: Recording) -> bool:
+    """Return whether the scenario of a recording has faults, which a replay draws again."""
+    return recording.scenario is not None and any(faults.any for faults in recording.scenario.all_faults)
+
+
 def stretch(recording: Recording, first: int, last: int, where: str) -> Recording:
     """Return the ticks from `first` to `last` of a recording."""
-    if first and recording.interference is not None:
+    if first and (recording.interference is not None or has_faults(recording)):
         raise DataError(f"{where}: from: its scenario has faults, whose times count from its own start")
     truth, judged, cut = recording.truth, ~recording.left_out, slice(first, last + 1)
     known = np.asarray(truth.known[:, judged].all(axis=1))

@@ -141,6 +141,16 @@ def test_a_start_without_a_true_pose_is_refused_with_the_next_time(whole: Record
     assert part(replace(whole, truth=Truth(*truth)), 2.5, robots="1,2").ticks
 
 
+def test_faults_of_the_scenario_are_those_of_the_whole(tmp_path: Path) -> None:
+    lie = {"faults__lie__kind": "jump", "faults__lie__start": 0.6}
+    write_recording(simulated(**lie), tmp_path / "log.mcap")
+    read = open_recording(tmp_path / "log.mcap")
+    with pytest.raises(DataError, match="from: its scenario has faults, whose times count from its own start"):
+        coopenv.run(tmp_path / "log.mcap", start=0.3)
+    errors = [[r.position_rmse_m for r in compare(["mekf"], source).rows] for source in (tmp_path / "log.mcap", read)]
+    assert errors[0] == errors[1] != [r.position_rmse_m for r in compare(["mekf"], simulated()).rows]
+
+
 def test_simulations_have_no_parts() -> None:
     with pytest.raises(CoopenvError, match="from is for recorded data, 'overtaking' is simulated"):
         coopenv.run("overtaking", start=1.0)

@@ -209,12 +209,7 @@ class LogFile(RecordSource):
 
     def _whole(self, seed: int = 0) -> Recording:
         """Return the file's record with the faults of its scenario."""
-        recording = open_recording(self.path)
-        if recording.scenario is not None and any(faults.any for faults in recording.scenario.all_faults):
-            # Messages are not recorded: the same are drawn again.
-            again = record(open_backend(self.path, None, {}), seed)
-            recording = replace(recording, interference=again.interference)
-        return recording
+        return _with_faults(open_recording(self.path), seed)
 
 
 @dataclass(frozen=True)
@@ -229,7 +224,16 @@ class GivenRecord(RecordSource):
 
     def recording(self, variant: str, seed: int) -> Recording:
         """Return it with a fault."""
-        return self.fault(variant).applied(self.given, seed)
+        return self.fault(variant).applied(_with_faults(self.given, seed), seed)
+
+
+def _with_faults(recording: Recording, seed: int) -> Recording:
+    """Return a recording with its scenario's faults, drawn again: files have no messages."""
+    from coopenv.backends.worlds import Replay, has_faults
+
+    if recording.interference is not None or not has_faults(recording):
+        return recording
+    return replace(recording, interference=record(Replay(recording, OBJECT), seed).interference)
 
 
 @dataclass(frozen=True)
