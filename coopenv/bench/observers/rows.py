@@ -201,7 +201,8 @@ def row_of(
     }
     each = np.sqrt(seeds("position_mse"))
     honest = mean_bounds(own[0].nees_dof, runs) if np.isfinite(anees).all() else NOWHERE
-    consistent = mean_bounds(int(dof * runs / len(own))) if dof > 0 else NOWHERE
+    freedom = dof * runs // len(own)
+    consistent = mean_bounds(int(freedom)) if freedom > 0 else NOWHERE
     return Row(
         environment=environment,
         variant=own[0].variant,

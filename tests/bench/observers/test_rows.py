@@ -18,7 +18,7 @@ import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers import compare, judge
 from coopenv.bench.observers.judge import LEVEL_BINS, TimeWindow, level_measures, windows_of
-from coopenv.bench.observers.rows import EDGES, UNKNOWN, WindowRow, checked_edges, mean_root, ratio, spread
+from coopenv.bench.observers.rows import EDGES, UNKNOWN, WindowRow, checked_edges, mean_root, ratio, row_of, spread
 from coopenv.bench.observers.tables import level_figures
 from coopenv.cli.app import main
 from coopenv.observers import run
@@ -75,6 +75,14 @@ def test_the_steady_window_is_the_leaderboard(found: coopenv.Comparison) -> None
         assert row.position_rmse_m == steady.position_rmse_m and row.anees == steady.anees
         assert row.anees_se == steady.anees_se > 0.0
         assert row.ratio_to_bound_ancestors_se == steady.ratio_to_bound_ancestors_se
+
+
+def test_fewer_degrees_of_freedom_than_seeds_have_no_bounds(found: coopenv.Comparison) -> None:
+    """The consistency of a few innovations in many seeds."""
+    runs = found.groups["nominal", "mekf_covariance"]
+    few = [replace(one, measures={**one.measures, "nis_dof": np.array([n, 0, 0, 0])}) for n, one in enumerate(runs)]
+    row = row_of("lane:4", few[:2] * 2, few[:2] * 2, 0)
+    assert np.isnan([row.nis_low, row.nis_high]).all() and np.isfinite(row.position_rmse_m)
 
 
 def test_windows_end_with_the_run() -> None:
