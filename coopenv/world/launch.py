@@ -25,14 +25,14 @@ import warp as wp
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import lock
-from coopenv.base.installation import available_cores, data_directory
+from coopenv.base.installation import available_cores
 from coopenv.world.warp_internals import cpu_features, field_types, replay_of
 
 ATTEMPTS = 3
 """Attempts to load a module: the second rebuilds it, the third is for two processes that rebuild the same one."""
 PROBE_BYTES = 5 << 20  # as much as the source and the code of a large module have
 LONGEST_COMPILATION = 120.0  # s; a process that holds a lock for longer is taken for suspended (Ctrl-Z)
-SHIPPED = data_directory("kernels")
+SHIPPED = Path(__file__).resolve().parents[1] / "data" / "kernels"  # no other folder: it has machine code
 """Compiled modules of the wheel; of a checkout those of `python -m benchmarks.kernels`."""
 _MODULE, _LOCKS = "wp_", "locks"
 """Prefix of the folders of modules; folder of the locks."""

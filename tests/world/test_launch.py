@@ -367,3 +367,7 @@ def test_modules_of_a_wheel_are_copied_and_not_compiled(tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert len([*tmp_path.rglob("*.o")]) >= 2
+
+
+def test_machine_code_is_taken_from_the_package_alone() -> None:
+    assert Path(coopenv.__file__).parent / "data" / "kernels" == launch.SHIPPED
