@@ -93,10 +93,10 @@ def test_a_class_name_means_one_class() -> None:
 LINES_AND_FILES = {
     ".": (129, 2),
     "api": (4401, 19),
-    "backends": (4014, 15),
+    "backends": (4015, 15),
     "base": (1947, 10),
     "bench": (5517, 18),
-    "cars": (11368, 43),
+    "cars": (11369, 43),
     "cli": (2719, 9),
     "estimation": (1917, 7),
     "evaluation": (492, 3),

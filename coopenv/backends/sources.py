@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from numbers import Real
@@ -81,6 +81,7 @@ class Selection:
         if until is not None and until <= (start or 0.0):
             raise CoopenvError(f"until: {until:g} s are not after the start at {start or 0.0:g} s")
         given: Any = str(robots).split(",") if isinstance(robots, str | Real) else robots
+        given = given if given is None or isinstance(given, Iterable) else ()
         names = None if given is None else tuple(dict.fromkeys(_robot_name(robot) for robot in given))
         if names is not None and ("" in names or not names):
             raise CoopenvError(f"robots: expected names or numbers such as 1,3, got {shown(robots)}")

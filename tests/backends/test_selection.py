@@ -120,6 +120,7 @@ def test_the_commands_take_a_part(data: Path, tmp_path: Path, capsys: pytest.Cap
         (("5", None, None), "from: expected a time"),
         ((None, None, ""), "robots: expected names or numbers such as 1,3, got ''"),
         ((None, None, []), "robots: expected names or numbers such as 1,3"),
+        ((None, None, object()), "robots: expected names or numbers such as 1,3, got <object"),
         ((None, None, 1.5), "drive: robots: unknown robot '1.5'"),
         ((None, 0.01, None), "drive: until: 0.01 s; 11.35 s are recorded, in steps of 0.05 s"),
         ((None, None, [9]), "drive: robots: unknown robot 'vehicle_9'.* known: vehicle_1, vehicle_2"),

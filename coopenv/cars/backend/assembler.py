@@ -212,12 +212,13 @@ class TopicClock:
         """Begin without messages."""
         self._times: deque[tuple[int, int]] = deque(maxlen=KEPT)  # of reception, and stamp
         self._usual: int | None = None  # delay of the last message that was not dropped
-        self.dropped = 0
-        """Messages with outlying stamps."""
+        self.taken = self.dropped = 0
+        """All messages, and messages with outlying stamps."""
 
     def put(self, stamp: int, received: int) -> bool:
         """Take a message; return whether its stamp fits those before. A jump of the clock fits after some messages."""
         self._times.append((received, stamp))
+        self.taken += 1
         if self._usual is not None and abs(received - stamp - self._usual) > OUTLYING:
             times = np.array([*islice(self._recent(), NEAR)][::-1], dtype=np.int64)
             if outlying(times[:, 1], times[:, 0])[-1]:
@@ -255,7 +256,7 @@ class TopicClock:
         parts = [f"{abs(delay.offset) * 1e-6:.1f} ms {'ahead' if delay.offset < 0 else 'behind'}"]
         parts += [f"drifts by {1e6 * delay.drift:+.0f} us per s"] if delay.drift else []
         parts += [f"jumped by {-delay.jump * NS:+.3f} s"] if delay.jump else []
-        return ", ".join([*parts, f"{self.dropped} of {len(self._times)} stamps dropped"])
+        return ", ".join([*parts, f"{self.dropped} of {self.taken} stamps dropped"])
 
 
 def measured_clocks(transport: Transport, fleet: Deployment, car: str, seconds: float) -> dict[str, TopicClock]:
