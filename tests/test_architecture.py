@@ -93,7 +93,7 @@ def test_a_class_name_means_one_class() -> None:
 LINES_AND_FILES = {
     ".": (129, 2),
     "api": (4401, 19),
-    "backends": (4015, 15),
+    "backends": (4017, 15),
     "base": (1947, 10),
     "bench": (5517, 18),
     "cars": (11369, 43),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -172,7 +173,8 @@ OBJECT = "recording"
 
 def is_recording(given: Any) -> TypeIs[Recording]:
     """Return whether a `Recording` is given, not the name of one."""
-    return type(given).__name__ == "Recording" and type(given).__module__ == "coopenv.observers.recording"
+    module = sys.modules.get("coopenv.observers.recording")  # loaded if there is one
+    return module is not None and isinstance(given, module.Recording)
 
 
 def source_name(given: ScenarioLike | Recording) -> str:

@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import coopenv
 from coopenv import CoopenvError, DataError
 from coopenv.backends.mcap import write_recording
-from coopenv.backends.sources import Selection, open_recording
+from coopenv.backends.sources import Selection, is_recording, open_recording
 from coopenv.base.errors import DataWarning
 from coopenv.bench.observers import compare
 from coopenv.cars.bags.topic_map import load_map
@@ -182,6 +182,8 @@ def test_a_recording_is_made_of_arrays(whole: Recording) -> None:
     short = {name: np.asarray(values)[:3] for name, values in arrays_of(whole).items() if "truth" in name}
     first = {"start_position": None, "start_rotation": None}
     assert_array_equal(Recording.from_arrays(**(arrays_of(whole) | first)).start_position, short["truth_position"][0])
+    derived = type("Derived", (Recording,), {}).from_arrays(**arrays_of(whole))
+    assert is_recording(derived) and not is_recording("mrclam_6")
 
 
 @pytest.mark.parametrize(
