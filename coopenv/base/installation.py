@@ -50,6 +50,7 @@ def sample_bags(folder: str | Path = "bags") -> Path:
     """Copy the sample bags to a folder, which is made if need be, and return its path.
 
     A drive of two fake cars in three forms, `mcap`, `sqlite3` and `ros1.bag`, and the map of its topics, `topics.toml`.
+    Files of these names are replaced.
 
     Raises:
         OutputError: the folder cannot be written to.
@@ -61,7 +62,9 @@ def sample_bags(folder: str | Path = "bags") -> Path:
 
 def install_command(extra: str) -> str:
     """Return the command that installs an extra: in or from a clone by its folder, or else by the package's name."""
-    clone = not (Path(__file__).resolve().parents[1] / "data").is_dir() or Path("coopenv", "__init__.py").is_file()
+    clone = (
+        not (Path(__file__).resolve().parents[1] / "data" / "envs").is_dir() or Path("coopenv", "__init__.py").is_file()
+    )
     return f"pip install '{'.' if clone else 'coopenv'}[{extra}]'"
 
 

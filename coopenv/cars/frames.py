@@ -1,6 +1,6 @@
 """Frames with tags: a renderer, and worlds whose bearings come from rendered frames by the detector of tags."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -152,6 +152,12 @@ class RenderedWorld(SimulatedWorld):
         self._cameras = scenario.cameras
         self._noisy = [noise.enabled for noise in scenario.noises]
         self._renderers = [FrameRenderer(Calibration.of(camera), scenario.images.family) for camera in self._cameras]
+
+    def set_parameters(self, values: Mapping[str, np.ndarray], worlds: np.ndarray) -> None:
+        """Set the parameters of the next resets, see `World`. Raises CoopenvError: a factor of bearing noise."""
+        if not np.isnan(values.get("bearing_noise", np.nan)).all():
+            raise CoopenvError("parameters: bearing_noise: the errors of rendered frames are the detector's")
+        super().set_parameters(values, worlds)
 
     @property
     def _world_kernels(self) -> Kernels:

@@ -363,6 +363,9 @@ def _problems_of_images(s: Scenario) -> Iterator[str]:
         yield f"{key} backend = 'simulated', got '{s.backend}'"
     if s.topology.mode != "sensed" or s.topology.most_nearby is not None:
         yield f"{key} topology.mode = 'sensed' without topology.most_nearby"
+    for name in ("randomisation", "difficulty"):
+        if getattr(s, name).bearing_noise != (1.0, 1.0):
+            yield f"{name}.bearing_noise: the errors of rendered frames are the detector's, see images.noise"
     if len(s.vehicles) > most:
         yield f"{key} at most {most} vehicles, got {len(s.vehicles)}"
     for i, camera in enumerate(s.cameras):

@@ -157,6 +157,7 @@ class TestWithDetector:
             r"'images' needs camera\.model = 'pinhole', quantise = false and undistort = true",
         ),
         ({"camera.image_size": [4000, 3000]}, r"camera\.image_size of at most 2,097,152 pixels, not so for vehicle_1"),
+        ({"randomisation.bearing_noise": [1.0, 2.0]}, r"randomisation\.bearing_noise: the errors of rendered frames"),
         ({"vehicles": [{"routes": ["south"]}] * 17}, r"sensing: 'images' needs at most 16 vehicles, got 17"),
     ],
 )
@@ -164,6 +165,13 @@ def test_settings_that_do_not_fit(changes: dict[str, Any], line: str) -> None:
     with pytest.raises(CoopenvError, match=line) as error:
         coopenv.load_scenario(EXAMPLE, changes)
     assert "\n" not in str(error.value)
+
+
+def test_a_factor_of_bearing_noise_is_refused() -> None:
+    env = coopenv.parallel_env(EXAMPLE)
+    with pytest.raises(CoopenvError, match=r"^parameters: bearing_noise: the errors of rendered frames are the det"):
+        env.reset(seed=0, options={"parameters": {"bearing_noise": 2.0}})
+    env.reset(seed=0, options={"parameters": {"odometry_noise": 2.0}})
 
 
 def test_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
