@@ -21,7 +21,6 @@ from types import CodeType, ModuleType
 from typing import Any
 
 from coopenv.base.errors import CoopenvError, UnknownEnvironmentError, error_text, shortened, shown, suggest
-from coopenv.base.files import writing
 
 SCENES = ("lane", "roots", "tree", "random", "ring", "road", "crossroad")
 """Kinds of parametric scenes, `lane:20`; see `coopenv.scenario.scenes`."""
@@ -55,6 +54,8 @@ def sample_bags(folder: str | Path = "bags") -> Path:
     Raises:
         OutputError: the folder cannot be written to.
     """
+    from coopenv.base.files import writing  # `import coopenv` needs no files
+
     with writing(folder):
         source, left_out = data_directory("examples/bags"), ignore_patterns("*.py", "__*")
         return copytree(source, Path(folder), ignore=left_out, copy_function=copyfile, dirs_exist_ok=True)
@@ -62,9 +63,8 @@ def sample_bags(folder: str | Path = "bags") -> Path:
 
 def install_command(extra: str) -> str:
     """Return the command that installs an extra: in or from a clone by its folder, or else by the package's name."""
-    clone = (
-        not (Path(__file__).resolve().parents[1] / "data" / "envs").is_dir() or Path("coopenv", "__init__.py").is_file()
-    )
+    shipped = Path(__file__).resolve().parents[1] / "data" / "envs"
+    clone = not shipped.is_dir() or Path("coopenv", "__init__.py").is_file()
     return f"pip install '{'.' if clone else 'coopenv'}[{extra}]'"
 
 

@@ -12,6 +12,7 @@ from coopenv.base.installation import list_agents, list_envs
 from coopenv.cars.deployment import Car, Deployment, GateLink, NetworkSettings, Remote, Safety, Security, Sensors
 from coopenv.cars.fake.settings import FakeSettings
 from coopenv.cars.profile import SVEA
+from coopenv.cars.sensor_settings import Correction
 from coopenv.cars.transport import Tls
 from coopenv.observers import registry
 from coopenv.observers.registry import ZOO
@@ -90,7 +91,7 @@ def test_the_page_on_deployment_files_has_every_key() -> None:
     found = {row.split("`")[1]: [cell.strip() for cell in row.split("|")[2:5]] for row in rows}
     parts = {"": Deployment, "cars.": Car, "network.": NetworkSettings, "network.tls.": Tls}
     parts |= {"gate.": GateLink, "sensors.": Sensors, "safety.": Safety, "remote.": Remote, "security.": Security}
-    parts |= {"fake.": FakeSettings}
+    parts |= {"fake.": FakeSettings, "sensors.corrections.": Correction}
     sections = {part.partition(".")[0] for part in parts if part} - {"cars"}
     wanted = {f"{prefix}{name}" for prefix, part in parts.items() for name in part.model_fields} - sections - {"file"}
     assert found.keys() == wanted and all(meaning for _, _, meaning in found.values())
