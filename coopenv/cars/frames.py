@@ -1,7 +1,7 @@
 """Frames with tags: a renderer, and worlds whose bearings come from rendered frames by the detector of tags."""
 
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,7 +43,7 @@ def pattern(family: str, number: int) -> Array:
     return np.where(np.pad(cells, 1, constant_values=255) > 127, WHITE, BLACK)
 
 
-@cache
+@lru_cache(maxsize=16)
 def pixel_rays(calibration: Calibration) -> tuple[Array, Array, Array]:
     """Return the rays (height, width, 3) of all pixels, at depth 1, and their changes downwards and to the right."""
     width, height = calibration.image_size
