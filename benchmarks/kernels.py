@@ -40,9 +40,8 @@ def main() -> int:
         for module in sorted(modules()):
             shutil.copytree(cache_folder() / module, target / module, ignore=shutil.ignore_patterns("*.cpp"))
     files = [path for path in target.rglob("*") if path.is_file()]
-    print(
-        f"{target}: {len({path.parent for path in files})} modules, {sum(path.stat().st_size for path in files) / 1e6:.1f} MB"
-    )
+    megabytes = sum(path.stat().st_size for path in files) / 1e6
+    print(f"{target}: {len({path.parent for path in files})} modules, {megabytes:.1f} MB")
     return 0
 
 
