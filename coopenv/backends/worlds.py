@@ -112,7 +112,7 @@ class Simulated(TickGenerator):
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
         """Simulate one world in float64, without an observer: deliveries do not depend on the contents of messages."""
         if self._world is None:
-            self._world = self.kind(self.scenario, 1, "float64", threads=1)
+            self._world = self.kind(self.scenario, 1, "float64", "cpu", 1)
         world, acting = self._world, [vehicle.motion.kind != "traffic" for vehicle in self.scenario.vehicles]
         world.reset(None if seed is None else [seed])
         command = yield world.full_tick(0)

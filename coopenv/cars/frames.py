@@ -131,15 +131,7 @@ class RenderedWorld(SimulatedWorld):
     The world decides which tags a vehicle has in view; nearer tags cover those behind them in its frame.
     """
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        worlds: int = 1,
-        dtype: str = "float32",
-        device: str = "cpu",
-        threads: int | None = None,
-        *observer: Any,
-    ) -> None:
+    def __init__(self, scenario: Scenario, worlds: int, dtype: str, device: str, threads: Any, *observer: Any) -> None:
         """Build the arrays and the renderers; arguments as for `World`, `threads` is not used.
 
         Raises:
@@ -237,6 +229,6 @@ class Rendered(Simulated):
             raise CoopenvError(f"images.family: {family} has {tags} tags, the scenario has {targets} targets")
         super().__init__(scenario)
 
-    def kind(self, *arguments: Any, **options: Any) -> RenderedWorld:
+    def kind(self, *arguments: Any) -> RenderedWorld:
         """Return the world; arguments and errors as for `RenderedWorld`."""
-        return RenderedWorld(*arguments, **options)
+        return RenderedWorld(*arguments)

@@ -46,7 +46,7 @@ class Figures(Logger):
 def trained(kind: type[Trainer], updates: int, **ppo: Any) -> tuple[Trainer, dict[str, Any]]:
     """Return a training after some updates, with the figures of the last one."""
     small = {"vehicles": 16, "decisions": 16, "minibatches": 2, "epochs": 2, **ppo}
-    trainer = kind(TrainingPlan(FOUR_WAY, Settings(ppo=Ppo(**small)), seed=3), coopenv.load_scenario(FOUR_WAY), 1)
+    trainer = kind(TrainingPlan(FOUR_WAY, Settings(ppo=Ppo(**small)), seed=1), coopenv.load_scenario(FOUR_WAY), 1)
     figures = Figures()
     trainer.model.set_logger(figures)
     trainer.begin()
@@ -74,9 +74,8 @@ def test_an_update_is_that_of_sb3(ppo: dict[str, Any]) -> None:
         assert ours == pytest.approx(theirs, abs=2e-4), name
     for name, theirs in original.model.policy.state_dict().items():
         change = float((theirs - start[name]).abs().max())
-        assert change > 1e-6, name  # that of a bias may be small by chance
-        bound = 0.01 * max(change, 1e-4)
-        assert lean.model.policy.state_dict()[name].numpy() == pytest.approx(theirs.numpy(), abs=bound), name
+        assert change > 1e-4, name
+        assert lean.model.policy.state_dict()[name].numpy() == pytest.approx(theirs.numpy(), abs=0.01 * change), name
     ours, theirs = (trainer.model.policy.optimizer.state_dict()["state"] for trainer in (lean, original))
     assert ours.keys() == theirs.keys()
     for index, moments in theirs.items():
