@@ -93,14 +93,14 @@ def test_a_class_name_means_one_class() -> None:
 LINES_AND_FILES = {
     ".": (129, 2),
     "api": (4401, 19),
-    "backends": (4017, 15),
+    "backends": (4019, 15),
     "base": (1950, 10),
     "bench": (5517, 18),
     "cars": (11367, 43),
     "cli": (2719, 9),
     "estimation": (1917, 7),
     "evaluation": (492, 3),
-    "observers": (11875, 42),
+    "observers": (11894, 43),
     "policies": (2077, 10),
     "runs": (3573, 13),
     "scenario": (3825, 12),
@@ -109,7 +109,7 @@ LINES_AND_FILES = {
     "world": (5626, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
-MOST_FILES = 243
+MOST_FILES = 244
 
 
 def test_wings_keep_their_budgets() -> None:

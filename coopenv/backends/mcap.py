@@ -33,8 +33,9 @@ from coopenv.backends.mcap_format import (
 from coopenv.base.errors import DataError, OutputError, check_memory, shown
 from coopenv.base.files import check_file, replacing_file
 from coopenv.base.installation import version
+from coopenv.observers.arrays import ARRAYS, sizes_of
 from coopenv.observers.contract import Setup
-from coopenv.observers.recording import ARRAYS, Recording, Truth, check_recording, sizes_of
+from coopenv.observers.recording import Recording, Truth, check_recording
 
 if TYPE_CHECKING:
     from coopenv.backends.mcap_container import Container

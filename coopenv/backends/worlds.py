@@ -14,8 +14,9 @@ from coopenv.backends.base import Capabilities, Episode, SensingWorld, TickGener
 from coopenv.backends.feed import RECORDED, Feed
 from coopenv.base.errors import CoopenvError, DataError, ScenarioWarning
 from coopenv.estimation import Sight
+from coopenv.observers.arrays import ARRAYS
 from coopenv.observers.contract import ObserverInit, sealed
-from coopenv.observers.recording import ARRAYS, Recording, Sensed, Truth, check_recording, is_due, recorded_arrays
+from coopenv.observers.recording import Recording, Sensed, Truth, check_recording, is_due, recorded_arrays
 from coopenv.observers.registry import find_embedded
 from coopenv.observers.runner import start_covariances
 from coopenv.scenario import Scenario, parse_scenario

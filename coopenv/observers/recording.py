@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, fields
 from itertools import chain
 from numbers import Integral, Real
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,18 +18,15 @@ from coopenv.base.sections import LARGEST
 from coopenv.estimation.poses import (
     MISFIT_DEG,
     Array,
-    Fields,
     Mask,
-    Rule,
-    are_covariances,
     are_numbers,
-    are_rotations,
     are_unit_vectors,
     bearing_misfit_deg,
     everywhere,
     exp_so3,
     exp_translation,
 )
+from coopenv.observers.arrays import ARRAYS, KINDS_OF_TICKS, invalid_rows, misshapen, sizes_of
 from coopenv.observers.contract import Gains, ObserverInit, Received, SensorNoise, Setup, Tick, sealed
 from coopenv.scenario.learning import MOST, PARAMETERS
 from coopenv.scenario.schema import neighbour_sets, processing_order
@@ -203,7 +200,8 @@ class Recording(Measurements):
             ("period", period, Integral, "a whole number of ticks"),
             ("noise", noise, SensorNoise, "a SensorNoise"),
         ):
-            _require(isinstance(value, kind), f"{name}: expected {expected}, got {shown(value)}")
+            valid = isinstance(value, kind) and not isinstance(value, bool)
+            _require(valid, f"{name}: expected {expected}, got {shown(value)}")
         _between("dt", dt, *TICK_LENGTHS_S)
         _between("period", period, 1, MAX_PERIOD_TICKS)
         std = _numbers("start_std", start_std)
@@ -363,109 +361,12 @@ def is_due(index: ArrayLike, ratio: float) -> NDArray[np.bool_]:
     return np.asarray(np.floor(k * ratio + 1e-9) > np.floor(np.maximum(k - 1, 0) * ratio + 1e-9))
 
 
-LARGEST_PAN = 3.15  # rad, after rounding
-LEAST_EIGENVALUE = 1e-12  # least eigenvalue of the correlations of an initial estimate
-
-
-def _vector(values: Array, others: Fields, model: Any) -> Mask:
-    return everywhere(are_numbers(values), -1)
-
-
-def _direction(values: Array, others: Fields, model: Any) -> Mask:
-    return are_unit_vectors(values) | (everywhere(np.isnan(values), -1) & ~others["visible"])
-
-
-def _sent(values: Array, others: Fields, model: Any) -> Mask:
-    return np.asarray((values == -1) | ((values >= 0) & (values <= others["now"]) & (values % others["period"] == 0)))
-
-
-VECTOR = Rule(f"finite numbers of at most {LARGEST:g}", _vector, axes=1)
-ROTATION = Rule("a rotation", lambda values, others, model: are_rotations(values), axes=2)
-DIRECTION = Rule("unit vectors, or NaN where nothing is visible", _direction, axes=1)
-COVARIANCE = Rule(
-    "a symmetric and positive definite matrix",
-    lambda values, others, model: are_covariances(values, LEAST_EIGENVALUE),
-    axes=2,
-)
-SENT = Rule("-1, nor a multiple of the message period up to now", _sent)
-FLAG = Rule("true or false", lambda values, others, model: np.ones(values.shape, dtype=bool))
-AGE = Rule("a number of at least 0", lambda values, others, model: values >= 0.0)
-ANGLE = Rule(f"within {LARGEST_PAN} rad", lambda values, others, model: np.abs(values) <= LARGEST_PAN)
-
-
-class ArraySpec(NamedTuple):
-    """One array of a tick, of a recording and of its log."""
-
-    axes: str  # K ticks (in a tick: none), N vehicles, T targets, L landmarks, or a length
-    rule: Rule
-    kind: str = "f"  # NumPy's
-    recorded: bool = True  # False: only ticks have it
-
-    def shape(self, sizes: Mapping[str, int]) -> tuple[int, ...]:
-        """Return the shape by the lengths of the axes; an axis without one is left out."""
-        return tuple(int(axis) if axis.isdigit() else sizes[axis] for axis in self.axes if axis != "K" or axis in sizes)
-
-
-ARRAYS = {
-    "rotation": ArraySpec("KN33", ROTATION),
-    "translation": ArraySpec("KN3", VECTOR),
-    "velocity": ArraySpec("KN3", VECTOR),
-    "angular_velocity": ArraySpec("KN3", VECTOR),
-    "bearings": ArraySpec("KNT3", DIRECTION),
-    "visible": ArraySpec("KNT", FLAG, "b"),
-    "landmarks": ArraySpec("KL3", VECTOR),
-    "inbox_tick": ArraySpec("KNN", SENT, "i"),
-    "due": ArraySpec("K", FLAG, "b"),
-    "pan": ArraySpec("KN", ANGLE),
-    "truth.rotation": ArraySpec("KN33", ROTATION._replace(of_truth=True)),
-    "truth.position": ArraySpec("KN3", VECTOR._replace(of_truth=True)),
-    "odometry_age": ArraySpec("KN", AGE, recorded=False),
-    "bearing_age": ArraySpec("KN", AGE, recorded=False),
-    "missing": ArraySpec("KN", FLAG, "b", recorded=False),
-    "late": ArraySpec("KN", FLAG, "b", recorded=False),
-    "start_rotation": ArraySpec("N33", ROTATION),
-    "start_position": ArraySpec("N3", VECTOR),
-    "start_covariance": ArraySpec("N66", COVARIANCE),
-}
-"""Arrays by name; arrays of the truth are fields of `Truth`."""
 MEASURED = tuple(field.name for field in fields(Measurements))
 """Arrays that every tick has."""
 PER_TICK = (*MEASURED, "inbox_tick")
 """Arrays of a recording that every tick of it has."""
 ROWS_OF_MISSING = (*MEASURED[:6], "pan", "odometry_age", "bearing_age")
 """Arrays of a tick of which the row of a missing vehicle is not read."""
-KINDS_OF_TICKS = {"f": "fiu", "i": "iu", "b": "b"}
-
-
-def sizes_of(setups: Sequence[Setup]) -> dict[str, int]:
-    """Return the lengths of the axes N, T and L."""
-    return {"N": len(setups), "T": len(setups[0].target_names), "L": setups[0].landmarks}
-
-
-def _misshapen(values: Mapping[str, Any], sizes: Mapping[str, int], kinds: Mapping[str, str]) -> Iterator[str]:
-    """Yield the errors of arrays with a shape or type other than the table's."""
-    for name, value in values.items():
-        spec = ARRAYS[name]
-        shape, kind = spec.shape(sizes), kinds[spec.kind]
-        if not (isinstance(value, np.ndarray) and value.shape == shape and value.dtype.kind in kind):
-            got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
-            yield f"{name}: expected an array of shape {shape} and kind {kind}, got {got}"
-
-
-def _invalid(values: Mapping[str, Array], about: Mapping[str, Any], ticks: bool) -> Iterator[tuple[str, Mask, str]]:
-    """Yield (name, which rows are valid, what the others are not); rows are those of ticks, if there are many, and N.
-
-    Args:
-        values: arrays by name.
-        about: further inputs of rules: the tick `now` and the message period.
-        ticks: True if arrays have the axis K.
-    """
-    for name, array in values.items():
-        axes, rule = ARRAYS[name].axes, ARRAYS[name].rule
-        valid = rule.valid(array, {**values, **about}, None, knows_truth=False)
-        rows = (axes[0] == "K" and ticks) + ("N" in axes)
-        unless = " or unknown (NaN)" if rule.of_truth else ""
-        yield name, everywhere(valid, *range(rows, valid.ndim)), f"not {rule.must_be}{unless}"
 
 
 def check_tick(tick: Sensed, index: int, observer_init: ObserverInit) -> None:
@@ -483,12 +384,12 @@ def check_tick(tick: Sensed, index: int, observer_init: ObserverInit) -> None:
     names = [name for name, spec in ARRAYS.items() if spec.axes[0] == "K" and name != "due"]
     given = {name: attrgetter(name)(tick) for name in names if tick.truth is not None or "." not in name}
     given = {name: value for name, value in given.items() if value is not None or name in MEASURED}
-    for problem in _misshapen(given, sizes_of(observer_init.setups), KINDS_OF_TICKS):
+    for problem in misshapen(given, sizes_of(observer_init.setups), KINDS_OF_TICKS):
         raise CoopenvError(f"tick {index}: {problem}")
     absent = given.get("missing", np.zeros(len(observer_init.setups), bool))
     seen = tick.visible & ~absent[:, None]
     given |= {"visible": seen, "bearings": np.where(seen[..., None], tick.bearings, np.nan)}
-    problems = _invalid(given, {"now": index, "period": 1}, ticks=False)
+    problems = invalid_rows(given, {"now": index, "period": 1}, ticks=False)
     for name, valid, problem in chain(problems, _invalid_messages(tick, len(absent))):
         valid = valid | absent if valid.ndim and name in ROWS_OF_MISSING else valid
         if not valid.all():
@@ -590,7 +491,7 @@ def recorded_arrays(r: Recording) -> dict[str, Any]:
     """Return the arrays of a recording by name. Raises DataError: one has another shape or type than it should."""
     names = [name for name, spec in ARRAYS.items() if spec.recorded and (name != "pan" or r.pan is not None)]
     values = {name: attrgetter(name)(r) for name in names}
-    for problem in _misshapen(values, {"K": r.ticks, **sizes_of(r.setups)}, {kind: kind for kind in "fib"}):
+    for problem in misshapen(values, {"K": r.ticks, **sizes_of(r.setups)}, {kind: kind for kind in "fib"}):
         raise DataError(problem)
     return values
 
@@ -598,7 +499,7 @@ def recorded_arrays(r: Recording) -> dict[str, Any]:
 def _check_arrays(r: Recording) -> None:
     values = recorded_arrays(r)
     about = {"now": np.arange(r.ticks)[:, None, None], "period": r.period}
-    for name, valid, problem in _invalid(values, about, ticks=True):
+    for name, valid, problem in invalid_rows(values, about, ticks=True):
         _require_all(r, name, valid, problem)
     later = np.diff(r.inbox_tick, axis=0, prepend=-1) >= 0
     _require_all(r, "inbox_tick", everywhere(later, 2), "sent before an earlier received message")

@@ -213,6 +213,7 @@ def test_a_recording_is_made_of_arrays(whole: Recording) -> None:
         ({"start_std": 0.1}, "start_std: expected two positive numbers, got 0.1"),
         ({"dt": "0.1"}, "dt: expected .*, got '0.1'"),
         ({"period": 1.5}, "period: expected .*, got 1.5"),
+        ({"period": True}, "period: expected .*, got True"),
         ({"noise": None}, "noise: expected .*SensorNoise.*, got None"),
         ({"landmarks": np.zeros((0, 3))}, r"bearings: expected K N T 3 = \(228, 5, 5, 3\), got"),
     ],
