@@ -120,6 +120,8 @@ class Setup:
     planar: bool = False
     """True for a vehicle that moves on a plane (z = 0, yaw only) and whose odometry is its commands, which need
     calibration, such as recorded robots."""
+    optical_axis: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    """Unit vector of the camera in the body frame, from which a wrong focal length moves bearings away."""
 
 
 @dataclass(frozen=True)

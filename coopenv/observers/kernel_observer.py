@@ -32,6 +32,12 @@ def views_of(record: Any, declared: Mapping[str, Any], vehicle: int = 0) -> Simp
     return SimpleNamespace(**{name: array[rows[name]] for name, array in arrays.items()})
 
 
+def rotation_to(axis: tuple[float, float, float]) -> Array:
+    """Return a rotation (3, 3) whose last column is a unit vector."""
+    _, _, rows = np.linalg.svd(np.array([axis], dtype=np.float64))
+    return np.column_stack((rows[1], np.cross(axis, rows[1]), axis))
+
+
 def model_of(setup: Setup, p: Precision) -> Any:
     """Return the model of the world from a vehicle's setup."""
     L, T = setup.landmarks, len(setup.target_names)
@@ -49,7 +55,7 @@ def model_of(setup: Setup, p: Precision) -> Any:
     model.order = model.rank = wp.array(np.arange(N, dtype=np.int32), dtype=wp.int32, device="cpu")
     model.start.covariance = wp.zeros(2 * N, dtype=mat66d, device="cpu")
     camera, noise, known = entry_struct(p, "camera")(), entry_struct(p, "noise")(), setup.noise
-    camera.rotation, camera.position = p.mat33(*np.eye(3).ravel()), p.vec3(*setup.lever_arm)
+    camera.rotation, camera.position = p.mat33(*rotation_to(setup.optical_axis).ravel()), p.vec3(*setup.lever_arm)
     for name in ("velocity", "angular_velocity", "bearing", "odometry_scale", "odometry_scale_walk"):
         setattr(noise, name, getattr(known, name))
     noise.gyro_bias, noise.gyro_bias_walk = p.vec3(*known.gyro_bias), p.vec3(*known.gyro_bias_walk)
@@ -92,6 +98,7 @@ class KernelObserver:
         self._model = model_of(setup, p)
         self._kernels = embedded if embedded.fit is None else embedded.fit(self._model)
         self._messages = self._kernels.messages or POSE
+        self._camera = rotation_to(setup.optical_axis)  # camera to body
         sizes = {**state_sizes(self._model, 1), **self._kernels.sizes}
         self._records = (
             allocate_state(self._model, 1, p, "cpu", shared="N"),
@@ -168,7 +175,7 @@ class KernelObserver:
         s.position[: self.setup.landmarks] = tick.landmarks
         s.sight[tick.targets] = np.where(tick.valid, _VISIBLE, _OUT_OF_VIEW)
         seen = tick.targets[tick.valid]
-        s.bearing[seen], s.bearing_tick[seen] = tick.bearings[tick.valid], now
+        s.bearing[seen], s.bearing_tick[seen] = tick.bearings[tick.valid] @ self._camera, now
 
     def _receive(self, messages: Mapping[int, Received], now: int) -> None:
         """Write the received messages; a malformed one, or one older than the start, is ignored."""

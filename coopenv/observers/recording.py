@@ -458,14 +458,14 @@ def _check_setup(setup: Setup, vehicle: int, first: Setup, where: str) -> None:
     for name in ("lever_arm", "marker"):
         _require(_is_array(getattr(setup, name), (3,)), f"{where}.{name}: not three numbers")
     noise, gains = setup.noise, setup.gains
+    for name, axis in (("optical_axis", setup.optical_axis), ("noise.image_axis", noise.image_axis)):
+        unit = axis is None or (np.shape(axis) == (3,) and bool(are_unit_vectors(np.array(axis, float))))
+        _require(unit, f"{where}.{name}: not a unit vector")
     for name, value in asdict(noise).items():
         if name not in ("odometry_period", "image_axis"):
             for entry in np.ravel(value):
                 _between(f"{where}.noise.{name}", float(entry), 0.0, LARGEST)
     _between(f"{where}.noise.odometry_period", noise.odometry_period, *TICK_LENGTHS_S)
-    if noise.image_axis is not None:
-        axis = np.array(noise.image_axis, float)
-        _require(axis.shape == (3,) and are_unit_vectors(axis), f"{where}.noise.image_axis: not a unit vector")
     for name, least in (("k", 0.5), ("max_turn", 0.0)):
         value = getattr(gains, name)
         _require(least < value <= LARGEST, f"{where}.gains.{name}: {shown(value)} is not in {least:g} .. {LARGEST:g}")

@@ -183,6 +183,7 @@ def observer_init_of(scenario: Scenario, model: Any) -> ObserverInit:
             marker=np.array(s.vehicles[i].marker, float),
             noise=_noise_of(scenario, i, cameras[i], noises[i]),
             gains=Gains(float(k[i]), q, s.observer.V, s.observer.P0, s.observer.max_turn),
+            optical_axis=_optical_axis(cameras[i]),
         )
         for i, name in enumerate(s.vehicle_names)
     )
@@ -195,6 +196,12 @@ def observer_init_of(scenario: Scenario, model: Any) -> ObserverInit:
         flight=max(s.v2x.delay, 1),
         start_covariance=start_covariances(s),
     )
+
+
+def _optical_axis(camera: Any) -> tuple[float, float, float]:
+    axis = camera["rotation"][:, 2].astype(float)
+    x, y, z = (axis / np.linalg.norm(axis)).tolist()
+    return x, y, z
 
 
 def _noise_of(scenario: Scenario, vehicle: int, camera: Any, noise: Any) -> SensorNoise:

@@ -15,6 +15,7 @@ from coopenv.base.errors import ScenarioWarning
 from coopenv.observers import Message, Recording, Run, Tick, run
 from coopenv.observers.contract import Estimate
 from coopenv.observers.group import Tamper
+from coopenv.observers.robust.memory import MOUNTING
 from coopenv.observers.robust.messages import from_six
 from coopenv.observers.robust.sources import NO_TARGET, VELOCITY
 from coopenv.runs.recorder import record
@@ -135,6 +136,7 @@ class Watched:
     recording: Recording
     source: np.ndarray  # (K, N, Q) records
     sensitivity: np.ndarray  # (K, N, Q, 6, 3) of the own error
+    calibration: np.ndarray  # (K, N, 3) records: the vehicle itself, and the members that stand for its errors
 
     def of(self, name: str, vehicle: int, target: int) -> np.ndarray:
         """Return (K, ...) a field of the monitor of a target, or its sensitivity; NaN without a slot."""
@@ -170,7 +172,9 @@ def watch(recording: Recording, tamper: Tamper | None = None) -> Watched:
     class Logging(OpenRobust):
         def update(self, tick: Tick) -> Estimate:
             estimate = super().update(tick)
-            for name, values in (("source", self.memory.source), ("sensitivity", self.memory.sensitivity[:, 0])):
+            memory = self.memory
+            own = ("calibration", memory.member[: MOUNTING + 1])
+            for name, values in (("source", memory.source), ("sensitivity", memory.sensitivity[:, 0]), own):
                 if name not in log:
                     log[name] = np.zeros((K, N, *values.shape), values.dtype)
                 log[name][tick.index, self.setup.vehicle] = values
@@ -178,4 +182,4 @@ def watch(recording: Recording, tamper: Tamper | None = None) -> Watched:
 
     result = run(Logging, recording, tamper)
     assert not result.failure
-    return Watched(result, recording, log["source"], log["sensitivity"])
+    return Watched(result, recording, log["source"], log["sensitivity"], log["calibration"])

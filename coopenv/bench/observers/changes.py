@@ -95,6 +95,16 @@ def with_camera_step(recording: Recording, fault: Fault, seed: int) -> Recording
     return replace(recording, bearings=bearings)
 
 
+def with_focal_error(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Let focal lengths be larger than observers know by a share, from a time on."""
+    bearings, first, on = recording.bearings.copy(), _first_tick(recording, fault), _on(recording, fault)
+    axes = np.array([setup.optical_axis for setup in recording.setups])[on, None]
+    along = np.einsum("knti,nui->knt", bearings[first:, on], axes)[..., None] * axes
+    wider = along + (1.0 + fault.value) * (bearings[first:, on] - along)
+    bearings[first:, on] = wider / np.linalg.norm(wider, axis=-1, keepdims=True)
+    return replace(recording, bearings=bearings)
+
+
 def with_scale_drift(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Let the scale error of odometries grow linearly from a time on, up to its value at the end."""
     start, end = fault.start_in(float(recording.t[-1])), float(recording.t[-1])

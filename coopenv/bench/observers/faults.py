@@ -20,6 +20,7 @@ from coopenv.bench.observers.changes import (
     usual_sender,
     with_camera_step,
     with_delay,
+    with_focal_error,
     with_gyro_step,
     with_jammer,
     with_lie,
@@ -92,6 +93,15 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         start=True,
         vehicles=True,
         change=with_camera_step,
+    ),
+    "focal_step": RecordFault(
+        "SHARE",
+        "by which focal lengths are too large from START on; undeclared",
+        0.05,
+        low=-0.9,
+        start=True,
+        vehicles=True,
+        change=with_focal_error,
     ),
     "scale_drift": RecordFault(
         "SHARE",

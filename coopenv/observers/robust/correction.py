@@ -8,7 +8,7 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import by_rows, displaced, recentring, transposed_by_rows
 from coopenv.observers.robust.joint_state import apply_corrections, set_block
 from coopenv.observers.robust.measurements import innovation_cross_covariance, innovation_weight, linearise, project
-from coopenv.observers.robust.memory import DERIVATIVES, BearingFrame, mat66d, vec6d
+from coopenv.observers.robust.memory import DERIVATIVES, ERRORS, BearingFrame, mat66d, vec6d
 from coopenv.world.warp_internals import device_function, subroutine
 
 
@@ -29,7 +29,7 @@ def linearise_again(frame: BearingFrame, memory: Any, world: int, i: int, share:
             linearise(frame, memory, world, i, n)
             for part in range(DERIVATIVES):
                 member = memory.derivative[world, i, n, part].member
-                if member >= 0 and member < estimated:
+                if member >= 0 and member < estimated and member != ERRORS:
                     G = memory.scratch[world, i, member].recentring
                     memory.derivative[world, i, n, part].jacobian = by_rows(
                         memory.derivative[world, i, n, part].jacobian, G
@@ -57,7 +57,7 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, projecti
     """Find the correction by all bearings that fit, without a change of the covariance.
 
     A sequential update with the residuals that the earlier bearings leave equals the batch update. Rejected bearings
-    correct nothing; the monitors limit their innovation to the gate. Considered members are not corrected.
+    correct nothing. Considered members are not corrected.
 
     Returns:
         The largest NIS of a bearing that fits, given the earlier ones, and the sum of all.
@@ -76,12 +76,12 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, projecti
             for part in range(DERIVATIVES):
                 k = memory.derivative[world, i, n, part].member
                 if k >= 0:
-                    left = memory.scratch[world, i, k].last_correction - memory.scratch[world, i, k].correction
+                    left = -memory.scratch[world, i, k].correction
+                    if k != ERRORS:  # which are not moved before the end, as bearings are linear in them
+                        left = left + memory.scratch[world, i, k].last_correction
                     residual = residual + memory.derivative[world, i, n, part].jacobian * left
             weighted = memory.measurement[world, i, n].weight * residual
             nis = wp.dot(weighted, residual)
-            if memory.measurement[world, i, n].fits == -1:
-                residual = residual * wp.sqrt(wp.min(wp.float64(constants.BEARING_GATE) / nis, wp.float64(1.0)))
             memory.measurement[world, i, n].innovation = residual
             if memory.measurement[world, i, n].fits == 1:
                 most = wp.max(most, nis)

@@ -18,6 +18,7 @@ from coopenv.observers.robust.joint_state import begin_calibration, insert_membe
 from coopenv.observers.robust.measurements import innovation_weight
 from coopenv.observers.robust.memory import (
     ERRORS,
+    FOCAL_ERROR,
     MOUNTING,
     SENDER_SLOTS,
     SOURCES,
@@ -32,7 +33,9 @@ from coopenv.observers.robust.memory import (
 from coopenv.observers.robust.messages import includes
 from coopenv.observers.robust.sources import (
     CAMERA,
+    FOCAL,
     GYRO,
+    PRIOR,
     VELOCITY,
     clear_drift,
     clear_source,
@@ -81,10 +84,12 @@ def add_to_calibration(memory: Any, world: int, i: int, q: int):
         square = wp.dot(v, v)
         if square > wp.float64(constants.MIN_VELOCITY_STD * constants.MIN_VELOCITY_STD):
             memory.sensitivity[world, i, q, ERRORS][3] -= v / square
+    elif q == FOCAL:
+        memory.sensitivity[world, i, q, ERRORS][FOCAL_ERROR, 0] += wp.float64(1.0)
     elif q == GYRO:
         for k in range(3):
             memory.sensitivity[world, i, q, ERRORS][k, k] -= wp.float64(1.0)
-    else:
+    elif q == CAMERA:
         if mounting_of(memory, world, i) == 0:
             insert_member(memory, world, i, MOUNTING)
             begin_calibration(memory, world, i, MOUNTING, vec6d())
@@ -205,6 +210,22 @@ def set_fault_mixture(memory: Any, world: int, i: int, most: Any, total: Any):
     memory.fault_mixture[world, i] = symmetric_part(mixture)
 
 
+@device_function
+def discount_rivals(memory: Any, world: int, i: int):
+    """Discount the evidence against other targets while the gate rejects one that has fitted before.
+
+    The gate compares that target with a pose on which all of them had agreed.
+    """
+    established = bool(False)
+    for q in range(1, PRIOR):
+        if is_active(memory, world, i, q) and is_rejected(memory, world, i, q):
+            if memory.source[world, i, q].fitted_time > wp.float64(constants.MEAN_TIME):
+                established = True
+    for q in range(1, PRIOR):
+        if established and not is_rejected(memory, world, i, q):
+            memory.source[world, i, q].ratio *= wp.float64(1.0 - constants.MODEL_ERROR)
+
+
 @subroutine
 def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: int):
     """Weigh the hypotheses after a block of a time, s; exclude the source of one nearly certain, own sensors first.
@@ -213,6 +234,7 @@ def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: in
     count as faulty. While the gate is disabled, the innovations of a wrong pose reveal faults of own sensors only.
     """
     end_block(memory, world, i, time)
+    discount_rivals(memory, world, i)
     memory.fault_mixture[world, i] = mat66d()
     lost = memory.belief[world, i].gate_disabled == 1
     gate = wp.float64(constants.FAULT_GATE)

@@ -1,10 +1,10 @@
-"""Integrity: one monitor per source of information (landmarks, senders, own odometry), and protection levels.
+"""Integrity: one monitor per source of information (landmarks, senders, own sensors), and protection levels.
 
 A fault of a source is an unknown vector f: the offset of a landmark from its place in the map, or of a sender from its
-reported position (m, map), or the error of the own velocity (m/s, body), angular velocity (rad/s, body) or camera (a
-turn of its mounting, rad). The own error depends on it by a sensitivity Phi, which passes through propagation and
-correction like the error itself, and an innovation r of covariance S by M = H Phi + H_f. The sums A of M^T S^-1 M and a
-of M^T S^-1 r are the information on all faults.
+reported position (m, map), or the error of the own velocity (m/s, body), angular velocity (rad/s, body), camera (a turn
+of its mounting, rad), focal length (a share, the first entry) or initial position (m, body). The own error depends on
+it by a sensitivity Phi, which passes through propagation and correction like the error itself, and an innovation r of
+covariance S by M = H Phi + H_f. The sums A of M^T S^-1 M and a of M^T S^-1 r are the information on all faults.
 
 Senders have errors within their covariance without a fault. These are eliminated: with the members' covariance P and
 Pi = (P^-1 + A)^-1, the rest for source q is V = A_qq - A_q Pi A_q^T and v = a_q - A_q Pi a. The fault of q is then
@@ -35,6 +35,7 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import KNOWN_ANGLE_VARIANCE, KNOWN_POSITION_VARIANCE, diagonal_by_rows
 from coopenv.observers.robust.memory import (
     ERRORS,
+    FOCAL_ERROR,
     MOUNTING,
     SENDER_SLOTS,
     SOURCES,
@@ -47,16 +48,30 @@ from coopenv.observers.robust.memory import (
 )
 from coopenv.observers.robust.sources import (
     CAMERA,
+    FOCAL,
+    PRIOR,
     VELOCITY,
     clear_drift,
     clear_source,
-    gate_locates_fault,
     is_active,
     is_own,
     is_rejected,
     is_sender,
 )
 from coopenv.world.warp_internals import device_function, subroutine
+
+QUANTILE = NormalDist().inv_cdf(1.0 - 0.5 * constants.RISK)  # of an error along its most uncertain axis
+
+
+@device_function
+def is_evidence(memory: Any, world: int, i: int, n: int) -> bool:
+    """Return whether a bearing counts for the monitors: it fits, or the gate rejects many bearings to its source.
+
+    Single outliers are no evidence of a lasting fault.
+    """
+    fits = memory.measurement[world, i, n].fits
+    q = memory.measurement[world, i, n].source
+    return fits == 1 or (fits == -1 and q >= 0 and is_rejected(memory, world, i, wp.max(q, 0)))
 
 
 @device_function
@@ -69,16 +84,20 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
     vector = memory.source[world, i, q].vector
     A = memory.information[world, i, q, 0]
     for n in range(frame.bearings):
-        fits = memory.measurement[world, i, n].fits
-        if fits != 0:
+        if is_evidence(memory, world, i, n):
             H = memory.derivative[world, i, n, 0].jacobian
             M = H * own
             if frame.mounting > 0:
                 M = M + memory.derivative[world, i, n, 2].jacobian * mounting
+            if frame.focal > 0:
+                M = M + memory.derivative[world, i, n, 3].jacobian * memory.sensitivity[world, i, q, frame.focal]
             if memory.measurement[world, i, n].source == q:
                 M = M - H[:, 3:] * turn
             if q == CAMERA:
                 M = M + memory.derivative[world, i, n, 2].jacobian[:, :3]
+            if q == FOCAL:
+                for k in range(2):
+                    M[k, 0] = M[k, 0] + memory.derivative[world, i, n, 3].jacobian[k, FOCAL_ERROR]
             WM = memory.measurement[world, i, n].weight * M
             weighted = WM
             if memory.measurement[world, i, n].member > 0:  # errors of messages are the same for that time
@@ -87,7 +106,7 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
             memory.effect[world, i, n, q] = M
             memory.weighted_effect[world, i, n, q] = weighted
             vector = vector + wp.transpose(weighted) * memory.measurement[world, i, n].innovation
-            if fits == 1:
+            if memory.measurement[world, i, n].fits == 1:
                 own = own - wp.transpose(memory.projection[world, i, n, 0]) * WM
                 change = wp.transpose(memory.projection[world, i, n, ERRORS]) * WM
                 memory.sensitivity[world, i, q, ERRORS] = memory.sensitivity[world, i, q, ERRORS] - change
@@ -114,6 +133,8 @@ def correct_drift_effect(frame: BearingFrame, memory: Any, world: int, i: int, q
             r = memory.derivative[world, i, n, 0].jacobian * memory.drift_effect[world, i, q - 1, 0]
             if frame.mounting > 0:
                 r = r + memory.derivative[world, i, n, 2].jacobian * memory.drift_effect[world, i, q - 1, MOUNTING]
+            if frame.focal > 0:
+                r = r + memory.derivative[world, i, n, 3].jacobian * memory.drift_effect[world, i, q - 1, frame.focal]
             if memory.measurement[world, i, n].source == q:
                 r = r - memory.derivative[world, i, n, 0].jacobian[:, 3:] * f
             weighted = memory.measurement[world, i, n].weight * r
@@ -157,7 +178,7 @@ def add_information(frame: BearingFrame, memory: Any, world: int, i: int, q: int
     """Add the information of a frame on the faults of a source and of a sender."""
     A = memory.information[world, i, q, c]
     for n in range(frame.bearings):
-        if memory.measurement[world, i, n].fits != 0:
+        if is_evidence(memory, world, i, n):
             A = A + wp.transpose(memory.weighted_effect[world, i, n, q]) * memory.effect[world, i, n, c]
     memory.information[world, i, q, c] = A
 
@@ -171,16 +192,19 @@ def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
             correct_source(frame, memory, world, i, q)
             if is_sender(q):
                 correct_drift_effect(frame, memory, world, i, q)
-            memory.source[world, i, q].rejected *= wp.float64(1.0) - weight  # out of view as well
-    for n in range(frame.bearings):
-        q = memory.measurement[world, i, n].source
-        if q >= 0 and memory.measurement[world, i, n].fits == -1:
-            memory.source[world, i, q].rejected += weight
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
             for c in range(1, wp.where(is_sender(q), q, 1 + SENDER_SLOTS)):
                 if is_active(memory, world, i, c):
                     add_information(frame, memory, world, i, q, c)
+    for q in range(SOURCES):
+        memory.source[world, i, q].rejected *= wp.float64(1.0) - weight  # out of view as well
+    for n in range(frame.bearings):
+        q = memory.measurement[world, i, n].source
+        if q >= 0 and memory.measurement[world, i, n].fits == -1:
+            memory.source[world, i, q].rejected += weight
+        elif q >= 0 and memory.measurement[world, i, n].fits == 1:
+            memory.source[world, i, q].fitted_time += frame.period
 
 
 @wp.func
@@ -268,38 +292,35 @@ def restart_fault(memory: Any, world: int, i: int, q: int):
 
 @subroutine
 def end_block(memory: Any, world: int, i: int, time: Any):
-    """Add the information of a block of a time, s, on each source's fault to its sums; begin the next block.
-
-    While the gate locates a fault, the block counts for the sources that it rejects, the camera and the gyro.
-    """
-    located = gate_locates_fault(memory, world, i)
+    """Add the information of a block of a time, s, on each source's fault to its sums; begin the next block."""
     count = eliminate_senders(memory, world, i, wp.float64(constants.MONITOR_TIME) / time)
     kept = wp.exp(-time / wp.float64(constants.MONITOR_TIME))
     memory.source[world, i, VELOCITY].time += time
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
-            V = mat33d()
-            v = vec3d()
-            if is_rejected(memory, world, i, q) or q >= CAMERA or not located:
-                V = memory.information[world, i, q, 0]
-                v = memory.source[world, i, q].vector
-                for b in range(count):
-                    c = source_at(memory, world, i, b)
-                    X = coupling(memory, world, i, count, q, b)
-                    V = V - X * wp.transpose(block_between(memory.information[world, i], q, c))
-                    v = v - X * memory.source[world, i, c].vector
+            V = memory.information[world, i, q, 0]
+            v = memory.source[world, i, q].vector
+            for b in range(count):
+                c = source_at(memory, world, i, b)
+                X = coupling(memory, world, i, count, q, b)
+                V = V - X * wp.transpose(block_between(memory.information[world, i], q, c))
+                v = v - X * memory.source[world, i, c].vector
             V = kept * memory.source[world, i, q].information + wp.float64(0.5) * (V + wp.transpose(V))
             v = kept * memory.source[world, i, q].sum + v
             memory.source[world, i, q].information = V
             memory.source[world, i, q].sum = v
             least = wp.float64(constants.ROUNDING) * wp.trace(V) + wp.float64(constants.MIN_VARIANCE)
+            variance = wp.float64(wp.inf)
             if is_own(q):
                 variance = own_fault_variance(memory, world, i, q)
                 least = wp.float64(1.0) / wp.max(variance, wp.float64(constants.MIN_VARIANCE))
             covariance = wp.inverse(V + least * wp.identity(3, wp.float64))
             memory.source[world, i, q].covariance = covariance
-            memory.source[world, i, q].offset = covariance * v
-            memory.source[world, i, q].ratio = wp.dot(v, covariance * v)
+            f = covariance * v
+            memory.source[world, i, q].offset = f
+            memory.source[world, i, q].ratio = wp.dot(v, f)
+            if wp.length_sq(f) > wp.float64(QUANTILE * QUANTILE) * variance:
+                memory.source[world, i, q].ratio = wp.float64(0.0)
             if is_sender(q):
                 end_drift_block(memory, world, i, q, time, kept)
             if q >= CAMERA and memory.source[world, i, q].ratio < wp.float64(constants.OFFSET_GATE):
@@ -312,12 +333,13 @@ def end_block(memory: Any, world: int, i: int, time: Any):
 
 @device_function
 def own_fault_variance(memory: Any, world: int, i: int, q: int):
-    """Return the variance of the fault of the own velocity, (m/s)^2, angular velocity, (rad/s)^2, or camera, rad^2."""
+    """Return the variance of a fault of the own sensors, see `OWN_FAULT`, or of the initial position, m^2."""
     variance = wp.float64(constants.OWN_FAULT * constants.OWN_FAULT)
-    return wp.where(q == VELOCITY, variance * wp.length_sq(memory.belief[world, i].mean_v), variance)
-
-
-QUANTILE = NormalDist().inv_cdf(1.0 - 0.5 * constants.RISK)  # of an error along its most uncertain axis
+    if q == VELOCITY:
+        variance = variance * wp.length_sq(memory.belief[world, i].mean_v)
+    if q == PRIOR:
+        variance = wp.float64(constants.KNOWN_POSITION * constants.KNOWN_POSITION)
+    return variance
 
 
 @wp.func

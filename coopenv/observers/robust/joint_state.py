@@ -250,8 +250,10 @@ def begin_errors(model: Any, memory: Any, world: int, i: int):
     noise = model.noise[i]
     odometry = odometry_variances(noise.gyro_bias, wp.float64(constants.GYRO_BIAS), noise.odometry_scale)
     mounting = mounting_variances(model, i)
-    one = wp.float64(1.0)  # entries without a state are arbitrary
-    begin_calibration(memory, world, i, ERRORS, vec6d(odometry[0], odometry[1], odometry[2], odometry[3], one, one))
+    focal = wp.float64(model.camera[i].focal_std)
+    one = wp.float64(1.0)  # an entry without a state is arbitrary
+    variances = vec6d(odometry[0], odometry[1], odometry[2], odometry[3], focal * focal, one)
+    begin_calibration(memory, world, i, ERRORS, variances)
     if wp.max(mounting) > wp.float64(0.0):
         variances = vec6d(mounting[0], mounting[0], mounting[0], mounting[1], mounting[1], mounting[1])
         begin_calibration(memory, world, i, MOUNTING, variances)

@@ -19,10 +19,20 @@ from coopenv.observers.robust.algebra import (
     position_variance,
 )
 from coopenv.observers.robust.joint_state import index_of, mounting_of, mounting_variances
-from coopenv.observers.robust.memory import MOUNTING, BearingFrame, Derivative, Pose, mat26d, mat66d, vec3d
+from coopenv.observers.robust.memory import (
+    ERRORS,
+    FOCAL_ERROR,
+    MOUNTING,
+    BearingFrame,
+    Derivative,
+    Pose,
+    mat26d,
+    mat66d,
+    vec3d,
+)
 from coopenv.observers.robust.messages import is_circular
 from coopenv.observers.robust.sources import is_excluded, slot_of, take_slot
-from coopenv.world.camera import VISIBLE, body_bearing, mapped_position
+from coopenv.world.camera import VISIBLE, body_bearing, camera_to_body, mapped_position
 from coopenv.world.nearby import agent_of, box_of_entry, entry_at, entry_count
 from coopenv.world.v2x import fresh
 from coopenv.world.warp_internals import device_function, subroutine
@@ -31,6 +41,7 @@ HALF_ACCELERATION = 0.5 * constants.MAX_ACCELERATION
 UNIFORM_VARIANCE = THIRD
 """Variance of a uniform distribution over [-1, 1], the paper's noise on the image plane."""
 ROUNDING_VARIANCE = 1.0 / 12.0  # of a number that is rounded to integers
+MOST_FOCAL_EFFECT = 0.25  # squared turn of a bearing by a relative error of the focal length, at 45 degrees
 SEARCH, RESECTION, TRACKING = 0, 1, 2  # purpose of a frame
 
 
@@ -206,10 +217,14 @@ def set_bearing_measurements(model: Any, state: Any, memory: Any, world: int, i:
     if purpose != SEARCH:  # since the last frame that has corrected the belief, one tick at least
         since = wp.float64(now.tick - state.corrected_tick[world, i]) * model.camera_period
         frame.period = wp.max(since, now.period)
+    R = camera_to_body(model, state, world, i)
+    frame.axis = vec3d(wp.float64(R[0, 2]), wp.float64(R[1, 2]), wp.float64(R[2, 2]))
+    focal = memory.P[world, i, ERRORS, ERRORS][FOCAL_ERROR, FOCAL_ERROR]
     if purpose == TRACKING:
         frame.mounting = mounting_of(memory, world, i)
+        frame.focal = wp.where(focal > wp.float64(constants.MIN_VARIANCE), ERRORS, 0)
     else:
-        frame.variance += mounting_variances(model, i)[0]
+        frame.variance += mounting_variances(model, i)[0] + wp.float64(MOST_FOCAL_EFFECT) * focal
     kept = model.kept
     for n in range(entry_count(model, state, world, i)):
         entry = entry_at(model, state, kept, world, i, n)
@@ -264,10 +279,17 @@ def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     if frame.mounting > 0:
         mounting = memory.member[world, i, frame.mounting].pose
         d = d - mounting.p
-        bearing = mounting.R * bearing
     distance = wp.max(wp.length(d), wp.float64(1.0e-9))
     inverse = wp.float64(1.0) / distance
     u = d * inverse
+    # A relative error of the focal length moves bearings so; of the predicted one, because noise of the measured one
+    # would be in innovation and derivative alike.
+    predicted = wp.transpose(mounting.R) * u
+    cosine = wp.dot(frame.axis, predicted)
+    away = cosine * (cosine * predicted - frame.axis)
+    if frame.focal > 0:
+        bearing = wp.normalize(bearing - memory.member[world, i, frame.focal].v[1] * away)
+    bearing = mounting.R * bearing
     T = tangent_basis(u)
     B = T * inverse
     H = mat26d()
@@ -284,6 +306,10 @@ def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     H[:, :3] = T * mounting.R * skew(memory.measurement[world, i, n].bearing)
     H[:, 3:] = -(B * mounting.R)
     memory.derivative[world, i, n, 2].jacobian = H
+    memory.derivative[world, i, n, 3].member = wp.where(frame.focal > 0, frame.focal, -1)
+    H = mat26d()
+    H[:, FOCAL_ERROR] = T * (mounting.R * away)
+    memory.derivative[world, i, n, 3].jacobian = H
     memory.measurement[world, i, n].residual = T * bearing
     memory.measurement[world, i, n].distance = distance
     remainder = linearisation_variance(memory, world, i, member, turn, u, distance, frame.period)
@@ -298,12 +324,15 @@ def project(memory: Any, world: int, i: int, n: int):
     H = memory.derivative[world, i, n, 0].jacobian
     member = memory.derivative[world, i, n, 1].member
     mounting = memory.derivative[world, i, n, 2].member
+    focal = memory.derivative[world, i, n, 3].member
     for k in range(memory.belief[world, i].members):
         rows = by_rows(H, memory.P[world, i, 0, k])
         if member > 0:
             rows = rows + by_rows(memory.derivative[world, i, n, 1].jacobian, memory.P[world, i, member, k])
         if mounting > 0:
             rows = rows + by_rows(memory.derivative[world, i, n, 2].jacobian, memory.P[world, i, mounting, k])
+        if focal > 0:
+            rows = rows + by_rows(memory.derivative[world, i, n, 3].jacobian, memory.P[world, i, focal, k])
         memory.projection[world, i, n, k] = rows
 
 
@@ -317,6 +346,9 @@ def innovation_cross_covariance(memory: Any, world: int, i: int, n: int, m: int)
     mounting = memory.derivative[world, i, n, 2].member
     if mounting > 0:
         S = S + memory.derivative[world, i, n, 2].jacobian * wp.transpose(memory.projection[world, i, m, mounting])
+    focal = memory.derivative[world, i, n, 3].member
+    if focal > 0:
+        S = S + memory.derivative[world, i, n, 3].jacobian * wp.transpose(memory.projection[world, i, m, focal])
     return S
 
 

@@ -65,7 +65,7 @@ class Member:
     box: wp.int32  # of its messages at this tick, see `coopenv.world.nearby`
     pose: Pose
     has_twist: wp.int32
-    v: vec3d  # m/s, body; of the odometry's errors: (scale, 0, 0)
+    v: vec3d  # m/s, body; of the errors of odometry and lens: (scale, relative focal length, 0)
     w: vec3d  # rad/s, body; of the odometry's errors: the gyro's bias
     clock_v: vec3d  # m/s, body: velocity at which clock offsets count, see correlated_fusion.py
     velocity_variance: wp.float64  # (m/s)^2 per axis, of v
@@ -87,6 +87,7 @@ class SourceMonitor:
     sum: vec3d  # v, of the blocks of late
     information: mat33d  # V, likewise
     rejected: wp.float64  # mean share of its bearings that fail the gate
+    fitted_time: wp.float64  # s for which its bearings have passed it
     ratio: wp.float64  # twice the logarithm of the likelihood ratio of its fault to none
     offset: vec3d  # f: its most likely fault, of an excluded one when it was excluded
     covariance: mat33d  # of that fault
@@ -162,6 +163,8 @@ class BearingFrame:
     tick: wp.int32
     bearings: wp.int32  # how many bearings can be used
     mounting: wp.int32  # the member that stands for the camera's mounting, 0 if there is none or it counts as noise
+    focal: wp.int32  # the member with the error of the focal length, likewise
+    axis: vec3d  # optical, unit vector in the body
     lever: vec3d  # m, of the camera in the body
     variance: wp.float64  # rad^2, of a bearing per tangent axis
     period: wp.float64  # s, since the last frame
@@ -250,7 +253,9 @@ class RobustMemory:
     inbox: array("WNY", SenderReport)  # per receiver and box
     inbox_sender: array("WNY", wp.int32)  # sender of that report, where not all are kept; -1: none
     measurement: array("WLX", BearingMeasurement)
-    derivative: array("WLXJ", Derivative)  # of a bearing, by the own error, that of its target, that of the mounting
+    derivative: array(
+        "WLXJ", Derivative
+    )  # of a bearing, by the own error, its target's, the mounting's, the focal length's
     scratch: array("WLK", Scratch)
     projection: array("WLXK", mat26d)  # H P, of a bearing and a member, see correction.py
     outbox_correlation: array("WNSC", Correlation)
@@ -259,11 +264,12 @@ class RobustMemory:
     factor: array("WLKK", mat66d)  # blocks of a Cholesky factor, on its diagonal their inverses
 
 
-ERRORS = 1  # the member that stands for the odometry's errors, where there is one, see joint_state.py
+ERRORS = 1  # the member that stands for the errors of odometry and of the focal length, see joint_state.py
+FOCAL_ERROR = 4  # that of the focal length among these errors
 MOUNTING = 2  # the member that stands for the error of the camera's mounting, where there is one, see joint_state.py
-DERIVATIVES = 3  # the most errors that a bearing depends on
+DERIVATIVES = 4  # the most errors that a bearing depends on
 SENDER_SLOTS, LANDMARK_SLOTS = MAX_MEMBERS - 1, 4
-SOURCES = 3 + SENDER_SLOTS + LANDMARK_SLOTS
+SOURCES = 5 + SENDER_SLOTS + LANDMARK_SLOTS
 ROBUST_SIZES = {
     "K": MAX_MEMBERS + MOUNTING,
     "H": MAX_HYPOTHESES + 1,

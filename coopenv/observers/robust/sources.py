@@ -21,8 +21,9 @@ from coopenv.observers.robust.memory import (
 )
 from coopenv.world.warp_internals import device_function, subroutine
 
-VELOCITY, CAMERA, GYRO = 0, SOURCES - 2, SOURCES - 1
-"""Slots of the own velocity, camera and angular velocity; slots of senders and landmarks are behind the first."""
+VELOCITY, PRIOR, FOCAL, CAMERA, GYRO = 0, SOURCES - 4, SOURCES - 3, SOURCES - 2, SOURCES - 1
+"""Slots of the own velocity, initial position, focal length, camera's mounting and angular velocity; slots of senders
+and landmarks are behind the first."""
 NO_TARGET = -1
 
 
@@ -35,7 +36,7 @@ def is_sender(q: int) -> bool:
 @wp.func
 def is_own(q: int) -> bool:
     """Return whether a slot is one of the own sensors."""
-    return q <= VELOCITY or q >= CAMERA
+    return q <= VELOCITY or q >= PRIOR
 
 
 @device_function
@@ -79,6 +80,8 @@ def begin_sources(memory: Any, world: int, i: int):
     memory.fault_mixture[world, i] = mat66d()
     for q in range(SOURCES):
         release_slot(memory, world, i, q)
+    for k in range(3):
+        memory.sensitivity[world, i, PRIOR, 0][k + 3, k] += wp.float64(1.0)
 
 
 @device_function
@@ -122,7 +125,7 @@ def take_slot(memory: Any, world: int, i: int, target: int, tick: int, landmark:
     q = slot_of(memory, world, i, target)
     if q < 0:
         first = wp.where(landmark, 1 + SENDER_SLOTS, 1)
-        q = longest_unseen_slot(memory, world, i, first, wp.where(landmark, CAMERA, 1 + SENDER_SLOTS))
+        q = longest_unseen_slot(memory, world, i, first, wp.where(landmark, PRIOR, 1 + SENDER_SLOTS))
         if landmark and q >= 0 and memory.source[world, i, q].target != NO_TARGET:
             unseen = wp.float64(tick - memory.source[world, i, q].seen_tick) * period
             q = wp.where(unseen > wp.float64(constants.MEAN_TIME), q, -1)
@@ -153,20 +156,6 @@ def is_excluded(memory: Any, world: int, i: int, q: int) -> bool:
 def is_rejected(memory: Any, world: int, i: int, q: int) -> bool:
     """Return whether the gate rejects many bearings to a source."""
     return memory.source[world, i, q].rejected > wp.float64(constants.FOUND_SHARE)
-
-
-@device_function
-def gate_locates_fault(memory: Any, world: int, i: int) -> bool:
-    """Return whether the gate rejects many bearings to a source, with no fault clearly more likely than its own."""
-    most = wp.float64(0.0)
-    for q in range(SOURCES):
-        if is_active(memory, world, i, q):
-            most = wp.max(most, memory.source[world, i, q].ratio)
-    for q in range(SOURCES):
-        if is_active(memory, world, i, q) and is_rejected(memory, world, i, q):
-            if memory.source[world, i, q].ratio > most - wp.float64(constants.ODDS):
-                return True
-    return False
 
 
 @device_function

@@ -309,6 +309,23 @@ def test_a_camera_turns_at_its_step() -> None:
     assert differing(after, made()) == {"bearings"}
 
 
+def test_a_focal_length_is_too_large_from_its_step_on() -> None:
+    """The tangent of the angle to the optical axis grows by that share."""
+    after, axis = changed_by("vehicle_2:focal_step=0.1@1"), made().setups[1].optical_axis
+    late = made().t >= 1.0 - 1e-9
+
+    def tangents(bearings: np.ndarray) -> np.ndarray:
+        along = bearings @ np.array(axis)
+        return np.asarray(np.sqrt(1.0 - along**2) / along)
+
+    assert_allclose(tangents(after.bearings[late, 1]), 1.1 * tangents(made().bearings[late, 1]), rtol=1e-9)
+    seen = np.isfinite(after.bearings[late, 1, :, 0])
+    assert_allclose(np.linalg.norm(after.bearings[late, 1][seen], axis=-1), 1.0)
+    assert_array_equal(after.bearings[~late], made().bearings[~late])
+    assert_array_equal(np.delete(after.bearings, 1, axis=1), np.delete(made().bearings, 1, axis=1))
+    assert differing(after, made()) == {"bearings"}
+
+
 def test_the_scale_error_grows_to_its_value() -> None:
     after, end = changed_by("scale_drift=0.1@1"), made().t[-1]
     for name in ("velocity", "translation"):

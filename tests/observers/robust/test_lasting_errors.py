@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from coopenv.observers.robust.constants import GYRO_BIAS
-from coopenv.observers.robust.memory import MOUNTING
+from coopenv.observers.robust.memory import ERRORS, MOUNTING
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.world.world import World
 from tests.helpers.builders import reset, simulate
@@ -187,6 +187,17 @@ def test_it_is_as_sure_as_it_may_be_and_finds_out_how_the_camera_is_turned() -> 
     sizes = np.einsum("wi,wi->w", error, np.linalg.solve(P, error[..., None])[..., 0])
     assert sizes.mean() < 9.0  # of three numbers; about 6 was seen, with a standard error of 1.5
     assert np.sqrt((error**2).mean()) < 0.7 * TURNED["camera.extrinsics_error"]
+
+
+def test_a_declared_error_of_the_focal_length_is_estimated() -> None:
+    """Of cameras that look ahead."""
+    focal = {"camera.extrinsics_error": 0.0, "camera.focal_length_error": 0.03, "camera.orientation": "forward"}
+    nees, error, world = judged("busy_intersection_tracking", range(16), 10, 20, **focal)
+    assert (nees.mean(axis=0) < 2.0).all() and error.mean() < 0.2, (nees.mean(axis=0), error.mean(axis=0))
+    known, P = world.memory.member.numpy()["v"][..., ERRORS, 1], world.memory.P.numpy()[..., ERRORS, ERRORS, 4, 4]
+    wrong = known - world.view("camera_focal")
+    assert (np.square(wrong) / P).mean() < 2.0
+    assert np.sqrt(np.square(wrong[:, 0]).mean()) < 0.1 * 0.03  # it sees three landmarks
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -16,8 +17,8 @@ from coopenv.api.engine import Engine
 from coopenv.base.errors import world_keys
 from coopenv.observers import Recording
 from coopenv.observers.robust.constants import FAULT_GATE, FOUND_SHARE, MEAN_TIME, MONITOR_TIME, SHORT_TIME
-from coopenv.observers.robust.memory import LANDMARK_SLOTS, SENDER_SLOTS, SOURCES
-from coopenv.observers.robust.sources import CAMERA, GYRO, NO_TARGET, VELOCITY
+from coopenv.observers.robust.memory import ERRORS, LANDMARK_SLOTS, SENDER_SLOTS, SOURCES
+from coopenv.observers.robust.sources import CAMERA, FOCAL, GYRO, NO_TARGET, PRIOR, VELOCITY
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers import robust_sources as faults
@@ -92,6 +93,33 @@ def test_a_sensitivity_is_the_derivative_of_the_estimate(
     for part in (slice(0, 3), slice(3, 6)):
         error = np.linalg.norm((found - expected)[:, part], axis=(1, 2))
         assert (error < 0.03 * np.linalg.norm(expected[:, part], axis=(1, 2))).all(), error
+
+
+def forwards(recording: Recording) -> Recording:
+    """Return a recording whose cameras look along the lane, so that a wrong focal length matters."""
+    return replace(recording, setups=tuple(replace(s, optical_axis=(0.0, 1.0, 0.0)) for s in recording.setups))
+
+
+def test_a_sensitivity_to_the_focal_length_is_the_derivative_of_the_estimate() -> None:
+    """Of the error, truth less estimate."""
+    recording, size, ticks = forwards(fast(4.2, 1)), 1e-4, (20, 30, 40)
+    without = watch(recording)
+    for vehicle in range(3):
+        faulty = watch(changed(recording, f"vehicle_{vehicle + 1}:focal_step={size}", 0))
+        found = without.sensitivity[ticks, vehicle, FOCAL][..., 0]
+        expected = [left_error(faulty.pose(k, vehicle), without.pose(k, vehicle)) / size for k in ticks]
+        assert_allclose(found, expected, rtol=0.05, atol=0.02 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("start", [0, 6])
+def test_a_wrong_focal_length_of_one_camera_is_found_and_costs_little(start: int) -> None:
+    """By 5 %: it becomes a state, and no other source is excluded."""
+    recording = forwards(fast(16.0, 0))
+    found = watch(changed(recording, f"vehicle_1:focal_step=0.05@{start}", 0))
+    assert found.source["exclusions"][-1, 0, FOCAL] > 0
+    assert not np.delete(found.source["exclusions"][-1, 0], FOCAL).any()
+    assert found.calibration[-1, 0, ERRORS]["v"][1] == pytest.approx(0.05, abs=0.003)
+    assert cost(found, watch(recording), start + 2.0)[0] < 1.3
 
 
 def test_a_source_out_of_view_is_not_rejected_for_ever() -> None:
@@ -283,6 +311,19 @@ def test_a_landmark_that_is_right_again_is_readmitted() -> None:
         assert 3.0 < excluded < 9.0 < readmitted < 14.0
         assert len(lasting.changes(vehicle, landmark)) == 1
     assert (cost(passing, usual(seen, 16.0, 0), 14.0) < 2.0).all()
+
+
+@pytest.mark.parametrize("size", [0.2, 0.6, 1.5])
+def test_a_wrong_initial_position_becomes_uncertain(size: float) -> None:
+    """In place of its deviation of 1 cm; no landmark is excluded for it."""
+    start, shown = (np.eye(3), np.zeros(3)), displaced((np.eye(3), np.zeros(3)), size * np.eye(6)[4])
+    observer = by_hand.started(start, np.diag([1e-3] * 3 + [1e-2] * 3) ** 2)
+    for k in range(1, 61):
+        bearings = {n: by_hand.direction(shown, by_hand.LANDMARKS[n]) for n in range(5)}
+        observer.update(by_hand.tick(observer, k, bearings=bearings))
+    exclusions = observer.memory.source["exclusions"]
+    assert exclusions[PRIOR] == 1 and not np.delete(exclusions, PRIOR).any()
+    assert_allclose(by_hand.pose_of(observer)[1], shown[1], atol=0.01)
 
 
 @pytest.mark.parametrize("seed", rest_slow(range(2), 0))
