@@ -10,7 +10,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -137,8 +137,11 @@ CHANGES = {
     "the second camera turns by 3 deg at 12 s": f"vehicle_2:camera_step={np.deg2rad(3.0)}@{STEP_AT}",
     "odometry scale error grows to 10 % in 30 s": "scale_drift=0.1",
     "10 % of the bearings random": "random_bearings=0.1",
+    "5 % of the bearings swapped": "wrong_association=0.05",
+    "focal length 5 % too large": "focal_step=0.05@0",
+    "initial estimates off by 3 m": "prior_error=3",
 }
-"""Faults of `coopenv.bench.observers.faults`."""
+"""Faults of `coopenv.bench.observers.faults`. A focal length is that of cameras which look ahead."""
 
 
 IN_TURN = "one landmark in turn off by {} m"
@@ -167,6 +170,11 @@ def changed(recording: Recording, fault: str, seed: int) -> Recording:
     words = {"LANDMARK": names[1 if count < 10 else 9], "IN_TURN": names[seen[seed % len(seen)]]}
     for word, name in words.items():
         fault = fault.replace(word, name)
+    if fault.startswith("focal"):
+        ahead = recording.velocity.mean(axis=0)
+        ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+        setups = [replace(s, optical_axis=tuple(a.tolist())) for s, a in zip(recording.setups, ahead, strict=True)]
+        recording = replace(recording, setups=tuple(setups))
     return variant_of(fault, "changed").applied(recording, seed)
 
 

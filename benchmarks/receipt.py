@@ -39,8 +39,9 @@ LIES = {
     "collusion": f"vehicle_1,vehicle_2:lie=collude:1@{AT:g}",
 }
 """See `--fault` of `coopenv bench observers`."""
-TRACKING_CASES = (*CASES, "passing", "large bias", "scale", *LIES)
-"""In the first scene; passing: a landmark that is wrong for 4 s."""
+TRACKING_CASES = (*CASES, "passing", "large bias", "scale", "swapped", *LIES)
+ROAD_CASES = (*CASES, "focal length", "prior")
+"""In the first scene; passing: a landmark that is wrong for 4 s. In the second one: `ROAD_CASES`."""
 
 
 def parts() -> dict[str, list[tuple[Any, str, Any]]]:
@@ -52,13 +53,21 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
         correction,
         correlated_fusion,
         fault_hypotheses,
+        integrity,
         measurements,
         observer,
     )
-    from coopenv.observers.robust.integrity import end_block
+    from coopenv.observers.robust.integrity import end_block, own_fault_variance
     from coopenv.observers.robust.memory import SENDER_SLOTS
-    from coopenv.observers.robust.sources import take_slot
+    from coopenv.observers.robust.sources import FOCAL, PRIOR, take_slot
     from coopenv.world.warp_internals import device_function
+
+    def without(source: int) -> Any:
+        @device_function
+        def variance(memory: Any, world: int, i: int, q: int):  # type: ignore[no-untyped-def]
+            return wp.where(q == source, wp.float64(0.0), own_fault_variance(memory, world, i, q))
+
+        return variance
 
     @device_function
     def no_landmark(memory: Any, world: int, i: int, target: int, tick: int, landmark: bool, period: Any):  # type: ignore[no-untyped-def]
@@ -95,6 +104,9 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
     return {
         "nothing": [],
         "joint gate of bearings": [(correction, "gate_jointly", no_joint_gate)],
+        "established pose": [(constants, "MODEL_ERROR", 0.0)],
+        "prior": [(integrity, "own_fault_variance", without(PRIOR))],
+        "focal length": [(integrity, "own_fault_variance", without(FOCAL))],
         "all monitors": [(constants, "FAULT_GATE", 1e30)],
         "monitors of the own sensors": [(constants, "OWN_FAULT", 1e-9)],
         "monitors of landmarks": [(measurements, "take_slot", no_landmark)],
@@ -166,7 +178,7 @@ def measure(variant: str, seeds: Sequence[int]) -> dict[str, Any]:
     for scene, made in (("tracking", evidence.tracking()), ("road", evidence.road())):
         for seed in seeds:
             recording = record(made, seed)
-            for case in TRACKING_CASES if scene == "tracking" else CASES:
+            for case in TRACKING_CASES if scene == "tracking" else ROAD_CASES:
                 add_case(found, scene, case, recording, seed)
     return found
 
@@ -208,6 +220,9 @@ def change_of(case: str) -> Callable[..., Any]:
         "large bias": f"gyro_step={np.radians(5.0)}@{STEP_AT}",
         "scale": "scale_drift=0.1",
         "random": "random_bearings=0.1",
+        "swapped": CHANGES["5 % of the bearings swapped"],
+        "focal length": CHANGES["focal length 5 % too large"],
+        "prior": CHANGES["initial estimates off by 3 m"],
         **LIES,
     }
     return passing if case == "passing" else lambda recording, seed: changed(recording, faults[case], seed)

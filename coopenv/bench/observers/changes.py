@@ -145,6 +145,14 @@ def with_jammer(recording: Recording, fault: Fault, seed: int) -> Recording:
     return with_deliveries(recording, ~jammed[:, :, None])
 
 
+def with_prior_error(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Shift initial estimates on the map by a distance; their covariances stay."""
+    drawn = np.random.default_rng([seed, 6]).random(len(recording.setups))
+    angle = np.broadcast_to(fault.options.get("angle", 2.0 * math.pi * drawn), drawn.shape)
+    offset = fault.value * _on(recording, fault)[:, None] * _horizontal(angle)
+    return replace(recording, start_position=recording.start_position + offset)
+
+
 def with_map_error(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Shift landmarks on the vehicles' maps, as `[faults.map_error]` of a scenario does; default: all of both."""
     false, names = _interference(recording), recording.setups[0].target_names

@@ -26,6 +26,7 @@ from coopenv.bench.observers.changes import (
     with_lie,
     with_loss,
     with_map_error,
+    with_prior_error,
     with_random_bearings,
     with_scale_drift,
     with_wrong_association,
@@ -124,6 +125,14 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         options={"angle": ANY, "spread": SIZE},
         vehicles=True,
         change=with_map_error,
+    ),
+    "prior_error": RecordFault(
+        "METRES",
+        "by which initial estimates are off on the map; undeclared",
+        3.0,
+        options={"angle": ANY},
+        vehicles=True,
+        change=with_prior_error,
     ),
     "jammer": RecordFault(
         "METRES",

@@ -253,9 +253,7 @@ class RobustMemory:
     inbox: array("WNY", SenderReport)  # per receiver and box
     inbox_sender: array("WNY", wp.int32)  # sender of that report, where not all are kept; -1: none
     measurement: array("WLX", BearingMeasurement)
-    derivative: array(
-        "WLXJ", Derivative
-    )  # of a bearing, by the own error, its target's, the mounting's, the focal length's
+    derivative: array("WLXJ", Derivative)  # of a bearing: by the errors of oneself, target, mounting, focal length
     scratch: array("WLK", Scratch)
     projection: array("WLXK", mat26d)  # H P, of a bearing and a member, see correction.py
     outbox_correlation: array("WNSC", Correlation)

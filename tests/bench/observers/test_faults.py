@@ -135,7 +135,7 @@ def test_the_recorded_world_has_the_fault() -> None:
         ("lie=replay:1@1,turn=1", "lie: no option 'turn'; allowed: std, honest_odometry"),
         ("lie=jump,std=1e300", r"lie: std: expected a number from 0 to 1e\+09, got '1e300'"),
         ("lie=jump,std=1,std=2", "'std=2' is not OPTION=VALUE, each option once"),
-        ("nosuch=1", "known: .*focal_length, clock, restart, corruption$"),
+        ("nosuch=1", "known: v2x_loss, .*focal_length, clock, restart, .*21 in all"),
         ("restart@101%", "restart: start: expected a number from 0 to 100, got '101'"),
         ("", "fault '': expected"),
         ("lie=jump/", "fault '': expected"),
@@ -307,6 +307,15 @@ def test_a_camera_turns_at_its_step() -> None:
     assert_array_equal(after.bearings[~late], made().bearings[~late])
     assert_array_equal(np.delete(after.bearings, 1, axis=1), np.delete(made().bearings, 1, axis=1))
     assert differing(after, made()) == {"bearings"}
+
+
+def test_initial_estimates_are_off() -> None:
+    """By a distance, in a direction that is drawn or given."""
+    shift = changed_by("vehicle_2:prior_error=3").start_position - made().start_position
+    assert_allclose(np.linalg.norm(shift[:, :2], axis=1), 3.0 * (np.arange(len(shift)) == 1))
+    given = changed_by("prior_error=2,angle=0")
+    assert_allclose(given.start_position - made().start_position, np.tile([2.0, 0.0, 0.0], (len(shift), 1)), atol=1e-12)
+    assert differing(given, made()) == {"start_position"}
 
 
 def test_a_focal_length_is_too_large_from_its_step_on() -> None:
