@@ -134,7 +134,6 @@ CHANGES = {
     "gyro bias steps to 1 deg/s at 12 s": f"gyro_step={np.deg2rad(1.0)}@{STEP_AT}",
     "gyro bias steps to 3 deg/s at 12.27 s": f"gyro_step={np.deg2rad(3.0)}@12.27",
     "cameras turn by 1 deg at 12 s": f"camera_step={np.deg2rad(1.0)}@{STEP_AT}",
-    "the second camera turns by 3 deg at 12 s": f"vehicle_2:camera_step={np.deg2rad(3.0)}@{STEP_AT}",
     "odometry scale error grows to 10 % in 30 s": "scale_drift=0.1",
     "10 % of the bearings random": "random_bearings=0.1",
     "5 % of the bearings swapped": "wrong_association=0.05",

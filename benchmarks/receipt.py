@@ -216,7 +216,7 @@ def change_of(case: str) -> Callable[..., Any]:
         "nominal": "",
         "landmark": CHANGES["one landmark off by 3 m"],
         "bias": f"gyro_step={np.radians(1.0)}@{STEP_AT}",
-        "camera": CHANGES["the second camera turns by 3 deg at 12 s"],
+        "camera": f"vehicle_2:camera_step={np.radians(3.0)}@{STEP_AT}",
         "large bias": f"gyro_step={np.radians(5.0)}@{STEP_AT}",
         "scale": "scale_drift=0.1",
         "random": "random_bearings=0.1",
