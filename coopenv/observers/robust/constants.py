@@ -50,6 +50,9 @@ FAULT_GATE, FAULT_RISK = 35.0, 1e-2
 """Gate of twice the logarithm of a fault's likelihood ratio to no fault; probability that the excluded source
 is correct. Tuned: in honest worlds the largest of all ratios was 34, with 30 % of the messages lost 48."""
 ODDS = -2.0 * math.log(FAULT_RISK)  # difference of such ratios at which one hypothesis is nearly certain
+MAX_EVIDENCE = 10.0 * BEARING_GATE
+"""Limit of the normalised squared innovation of a rejected bearing: without it, random bearings to a target of which
+some fail the gate are evidence of other faults; at 1, which of several sources is wrong shows too late. Tuned."""
 MODEL_ERROR = 0.05
 """Share of the evidence against a source that errors of linearisation may explain: sources that differ by less are
 equally likely. Chosen."""
@@ -57,8 +60,7 @@ MONITOR_TIME = 10.0  # s: time constant of the sums of a monitor. Chosen
 OWN_FAULT = 0.1  # deviation of a fault of velocity and focal length, as a share, gyro, rad/s, and camera, rad. Chosen
 LOST_SHARE, FOUND_SHARE = 0.6, 0.2
 """Share of bearings that fail the gate from which on all bearings count, and share below which the gate counts again
-and the pose is an anchor. Chosen: one wrong association of two does not exceed the first. Of the bearings to one source
-likewise: from the first on they are evidence of a fault."""
+and the pose is an anchor. Chosen: one wrong association of two does not exceed the first."""
 
 # Messages
 

@@ -57,7 +57,7 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, projecti
     """Find the correction by all bearings that fit, without a change of the covariance.
 
     A sequential update with the residuals that the earlier bearings leave equals the batch update. Rejected bearings
-    correct nothing. Considered members are not corrected.
+    correct nothing; the monitors limit their innovation. Considered members are not corrected.
 
     Returns:
         The largest NIS of a bearing that fits, given the earlier ones, and the sum of all.
@@ -82,6 +82,8 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, projecti
                     residual = residual + memory.derivative[world, i, n, part].jacobian * left
             weighted = memory.measurement[world, i, n].weight * residual
             nis = wp.dot(weighted, residual)
+            if memory.measurement[world, i, n].fits == -1:
+                residual = residual * wp.sqrt(wp.min(wp.float64(constants.MAX_EVIDENCE) / nis, wp.float64(1.0)))
             memory.measurement[world, i, n].innovation = residual
             if memory.measurement[world, i, n].fits == 1:
                 most = wp.max(most, nis)

@@ -55,6 +55,7 @@ from coopenv.observers.robust.sources import (
     clear_source,
     is_active,
     is_own,
+    is_rejected,
     is_sender,
 )
 from coopenv.world.warp_internals import device_function, subroutine
@@ -64,14 +65,13 @@ QUANTILE = NormalDist().inv_cdf(1.0 - 0.5 * constants.RISK)  # of an error along
 
 @device_function
 def is_evidence(memory: Any, world: int, i: int, n: int) -> bool:
-    """Return whether a bearing counts for the monitors: it fits, or the gate rejects most bearings to its source.
+    """Return whether a bearing counts for the monitors: it fits, or the gate rejects many bearings to its source.
 
     Single outliers are no evidence of a lasting fault.
     """
     fits = memory.measurement[world, i, n].fits
     q = memory.measurement[world, i, n].source
-    most = memory.source[world, i, wp.max(q, 0)].rejected > wp.float64(constants.LOST_SHARE)
-    return fits == 1 or (fits == -1 and q >= 0 and most)
+    return fits == 1 or (fits == -1 and q >= 0 and is_rejected(memory, world, i, wp.max(q, 0)))
 
 
 @device_function

@@ -127,7 +127,7 @@ def verdicts(made: Scenario, seed: int, seconds: int) -> tuple[np.ndarray, np.nd
     ("lie", "by"),
     [
         ({"kind": "jump", "start": 2.0}, [2, 3, 4]),
-        ({"kind": "replay", "start": 4.0}, [2]),  # the last vehicle excludes those whom the liar has misled
+        ({"kind": "replay", "start": 4.0}, [2, 4]),
         ({"kind": "drift", "speed": 0.2}, [2, 3, 4]),
     ],
     ids=str,
