@@ -218,7 +218,7 @@ def test_numbers_that_follow_from_a_constant_follow_its_change(monkeypatch: pyte
     assert_allclose([constants.RISK / before["RISK"], constants.MARGIN / before["MARGIN"]], [2.0, 1.0])
     gates = {f"{of}_GATE" for of in ("BEARING", "OFFSET", "POSE", "JUMP")}
     smaller = {name for name in before if getattr(constants, name) < before[name]}
-    assert smaller == {*gates, "PRUNE_GAP", "MAX_PRIOR_COST", "MAX_MISFIT"}
+    assert smaller == {*gates, "PRUNE_GAP", "MAX_PRIOR_COST", "MAX_MISFIT", "MAX_EVIDENCE"}
     receipt.leave_out("nothing")
     assert {name: getattr(constants, name) for name in before} == before
     assert {"MARGIN", "RISK", "FAULT_RISK"} <= {*receipt.numbers()}
