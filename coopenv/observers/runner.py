@@ -183,7 +183,7 @@ def observer_init_of(scenario: Scenario, model: Any) -> ObserverInit:
             marker=np.array(s.vehicles[i].marker, float),
             noise=_noise_of(scenario, i, cameras[i], noises[i]),
             gains=Gains(float(k[i]), q, s.observer.V, s.observer.P0, s.observer.max_turn),
-            optical_axis=_optical_axis(cameras[i]),
+            optical_axis=_in_body(cameras[i], (0.0, 0.0, 1.0)),
         )
         for i, name in enumerate(s.vehicle_names)
     )
@@ -198,9 +198,10 @@ def observer_init_of(scenario: Scenario, model: Any) -> ObserverInit:
     )
 
 
-def _optical_axis(camera: Any) -> tuple[float, float, float]:
-    axis = camera["rotation"][:, 2].astype(float)
-    x, y, z = (axis / np.linalg.norm(axis)).tolist()
+def _in_body(camera: Any, direction: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return the unit vector in the body frame of a direction (3,) in the camera frame."""
+    along = camera["rotation"].astype(float) @ np.array(direction, float)
+    x, y, z = (along / np.linalg.norm(along)).tolist()
     return x, y, z
 
 
@@ -209,9 +210,7 @@ def _noise_of(scenario: Scenario, vehicle: int, camera: Any, noise: Any) -> Sens
     bearing, axis = float(noise["bearing"]), None
     if noise["bearing_paper"]:
         bearing /= math.sqrt(3.0)
-        along = camera["rotation"].astype(float) @ np.array(scenario.noises[vehicle].bearing.axis, float)
-        x, y, z = (along / np.linalg.norm(along)).tolist()
-        axis = x, y, z
+        axis = _in_body(camera, scenario.noises[vehicle].bearing.axis)
     if camera["quantise"]:
         bearing = math.hypot(bearing, 1.0 / (math.sqrt(12.0) * float(camera["focal_length"].min())))
     rate, duration, size, angle = (float(noise[f"slip_{name}"]) for name in ("rate", "duration", "size", "angle"))
