@@ -2,10 +2,11 @@
 
 Without arguments it leaves out one part after the other, and all monitors together. Columns of the table in Markdown:
 false exclusions per hour of a vehicle in worlds without a fault; median time from a lie to the exclusion of its sender;
-median CPU time of an update, us; mean position RMSE of honest vehicles by case, m. With `--constants` it halves and
-doubles each constant that follows from no other one; those that follow from it change with it. Every variant runs in a
-process of its own, in which functions or constants are replaced before compilation, which takes half a minute per
-variant, once per machine.
+median CPU time of an update, us; mean position RMSE of honest vehicles by case, m. With `--without` it leaves out the
+given parts, or several together, as in `--without "readmission + prior"`. With `--constants` it halves and doubles each
+constant that follows from no other one; those that follow from it change with it. Every variant runs in a process of
+its own, in which functions or constants are replaced before compilation, which takes half a minute per variant, once
+per machine.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.options import at_least
+from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.base.format import in_parentheses
 from coopenv.bench.pages import table
 from coopenv.runs.console import Progress
@@ -154,15 +156,35 @@ def set_constants(values: Mapping[str, float]) -> None:
         vars(constants).update({name: values[name] for name in names if name in values})
 
 
-def leave_out(variant: str) -> None:
-    """Replace what a part consists of, or multiply a constant, before anything is compiled: a part, or NAME*FACTOR."""
+def changes_of(variant: str) -> list[tuple[Any, str, Any]]:
+    """Return what a variant replaces, see `leave_out`.
+
+    Raises:
+        CoopenvError: there is no such part, or two replace the same function or number.
+    """
     from coopenv.observers.robust import constants
 
     if "*" in variant:
         name, factor = variant.split("*")
-        changes = [(constants, name, getattr(constants, name) * float(factor))]
-    else:
-        changes = parts()[variant]
+        return [(constants, name, getattr(constants, name) * float(factor))]
+    known, changes = parts(), []
+    for part in map(str.strip, variant.split("+")):
+        check_one_of("unknown part", part, known)
+        changes += known[part]
+    if len({(module.__name__, name) for module, name, _ in changes}) < len(changes):
+        raise CoopenvError(f"parts that replace the same function or number cannot be left out together: {variant!r}")
+    return changes
+
+
+def leave_out(variant: str) -> None:
+    """Replace what parts consist of, or multiply a constant, before anything is compiled: PART + PART, or NAME*FACTOR.
+
+    Raises:
+        CoopenvError: see `changes_of`.
+    """
+    from coopenv.observers.robust import constants
+
+    changes = changes_of(variant)
     set_constants({name: value for module, name, value in changes if module is constants})
     for module, name, value in changes:
         setattr(module, name, value)
@@ -287,13 +309,29 @@ def part_table(results: dict[str, dict[str, Any]]) -> str:
 def constant_table(results: dict[str, dict[str, Any]]) -> str:
     """Return the table of the numbers: ratio of the RMSE to that with all as they are, nominal and over the faults."""
     base, rows = results["nothing"]["rmse"], []
+    faults = [case for case in base if not case.endswith(": nominal")]
+    nominal = [case for case in base if case not in faults]
     for variant, found in results.items():
-        ratio = {case: float(np.mean(values) / np.mean(base[case])) for case, values in found["rmse"].items()}
-        nominal = [r for case, r in ratio.items() if case.endswith(": nominal")]
-        faults = [r for case, r in ratio.items() if not case.endswith(": nominal")]
-        cells = (f"{np.mean(nominal):.2f}", f"{np.mean(faults):.2f}", f"{max(faults):.2f}")
-        rows.append([variant, *cells, f"{found['exclusions'] / found['hours']:.1f}"])
-    return table(["number", "without fault", "faults, mean", "faults, worst", "false exclusions, 1/h"], rows)
+        rmse = found["rmse"]
+        worst = max(faults, key=lambda case: np.mean(rmse[case]) / np.mean(base[case]))
+        cells = [_ratio(rmse, base, cases) for cases in (nominal, faults, [worst])]
+        rows.append([variant, *cells, worst, f"{found['exclusions'] / found['hours']:.1f}"])
+    return table(["number", "without fault", "faults, mean", "worst fault", "which", "false exclusions, 1/h"], rows)
+
+
+def _ratio(rmse: Mapping[str, Any], base: Mapping[str, Any], cases: Sequence[str]) -> str:
+    """Return the mean over the cases of the ratio of mean RMSE, with its standard error over the seeds (jackknife)."""
+    pairs = np.array([[rmse[case], base[case]] for case in cases])  # cases, 2, seeds
+    count = pairs.shape[-1]
+
+    def ratio(kept: np.ndarray) -> float:
+        means = kept.mean(axis=-1)
+        return float(np.mean(means[:, 0] / means[:, 1]))
+
+    if count == 1:
+        return in_parentheses(ratio(pairs), np.nan)
+    others = [ratio(np.delete(pairs, seed, axis=-1)) for seed in range(count)]
+    return in_parentheses(ratio(pairs), float(np.sqrt(count - 1) * np.std(others)))
 
 
 def _mean(values: Sequence[float]) -> str:
@@ -306,14 +344,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.receipt", description=__doc__)
     parser.add_argument("--seeds", type=at_least(1), default=8, help="number of seeds (default: 8)")
     parser.add_argument("--first", type=at_least(0), default=7000, help="the first seed (default: 7000)")
-    parser.add_argument("--constants", nargs="*", help="names of constants; none: all")
-    parser.add_argument("--variant", help=argparse.SUPPRESS)
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--without", nargs="+", metavar="PART", help="parts, or several as in 'PART + PART'")
+    what.add_argument("--constants", nargs="*", metavar="NAME", help="names of constants; none: all")
+    what.add_argument("--variant", help=argparse.SUPPRESS)
     asked = parser.parse_args(arguments)
     seeds = range(asked.first, asked.first + asked.seeds)
     if asked.variant:
         print(json.dumps(measure(asked.variant, seeds)))
         return 0
-    variants = list(parts())
+    variants = ["nothing", *asked.without] if asked.without else list(parts())
+    try:
+        for variant in variants:
+            changes_of(variant)
+    except CoopenvError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     if asked.constants is not None:
         unknown = sorted(set(asked.constants) - set(numbers()))
         if unknown:
