@@ -57,6 +57,7 @@ from coopenv.observers.robust.sources import (
     is_own,
     is_rejected,
     is_sender,
+    note_rejection,
 )
 from coopenv.world.warp_internals import device_function, subroutine
 
@@ -202,7 +203,7 @@ def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
     for n in range(frame.bearings):
         q = memory.measurement[world, i, n].source
         if q >= 0 and memory.measurement[world, i, n].fits == -1:
-            memory.source[world, i, q].rejected += weight
+            note_rejection(memory, world, i, q, weight)
         elif q >= 0 and memory.measurement[world, i, n].fits == 1:
             memory.source[world, i, q].fitted_time += frame.period
 

@@ -159,6 +159,23 @@ def is_rejected(memory: Any, world: int, i: int, q: int) -> bool:
 
 
 @device_function
+def note_rejection(memory: Any, world: int, i: int, q: int, weight: Any):
+    """Add a bearing that the gate rejects, of a weight, to a source's share of rejected ones.
+
+    A landmark that had fitted, without evidence against it, and is rejected now has a fault that begins now.
+    """
+    before = is_rejected(memory, world, i, q)
+    rejected = memory.source[world, i, q].rejected + weight
+    memory.source[world, i, q].rejected = rejected
+    fitted = memory.source[world, i, q].fitted_time > wp.float64(constants.MEAN_TIME)
+    fitted = fitted and memory.source[world, i, q].ratio < wp.float64(constants.OFFSET_GATE)
+    if fitted and not before and is_rejected(memory, world, i, q) and not is_sender(q):
+        clear_source(memory, world, i, q)
+        memory.source[world, i, q].rejected = rejected
+        memory.source[world, i, q].fitted_time = wp.float64(0.0)
+
+
+@device_function
 def propagate_sources(memory: Any, world: int, i: int, step: Pose, G: Any, dt: Any):
     """Carry the sensitivities through an increment of odometry over dt; G: of the own error by the odometry's."""
     for q in range(SOURCES):

@@ -24,7 +24,7 @@ from coopenv.scenario import Scenario, load_scenario
 from tests.helpers import robust_sources as faults
 from tests.helpers import robust_ticks as by_hand
 from tests.helpers.env_suite import rest_slow
-from tests.helpers.robust_sources import Lies, Watched, busy, fast, seen, watch, wrong_landmark
+from tests.helpers.robust_sources import Lies, Watched, busy, fast, hidden_landmark, seen, watch, wrong_landmark
 from tests.helpers.robust_ticks import PERIOD, displaced, left_error
 
 FIRST = 3  # the target of the first vehicle in the paper's scene
@@ -296,6 +296,16 @@ def test_a_turn_of_a_camera_costs_nothing(make: Callable[..., Recording], vehicl
     assert not np.delete(corrected, (CAMERA, GYRO), axis=1).any()
     assert np.all(found.run.position_rmse(least) < 1.3 * usual(make, horizon, 0).run.position_rmse(least) + 0.02)
     assert found.run.anees(least)[vehicle] < 3.0
+
+
+@pytest.mark.parametrize("end", [16.0, np.inf])
+@pytest.mark.parametrize("seed", rest_slow([3, 4, 5], 1))
+def test_a_landmark_that_jumps_costs_no_more_than_without_it(seed: int, end: float) -> None:
+    recording = busy(24.0, seed)
+    watched = watch(wrong_landmark(recording, 1, 3.0 * METRE, 12.0, end))
+    assert {target for _, target in watched.excluded()} <= {1}
+    hidden = watch(hidden_landmark(recording, 1, 12.0))
+    assert cost(watched, hidden, 12.0).max() < 1.3
 
 
 def test_a_landmark_that_is_right_again_is_readmitted() -> None:
