@@ -100,7 +100,7 @@ LINES_AND_FILES = {
     "cli": (2719, 9),
     "estimation": (1917, 7),
     "evaluation": (492, 3),
-    "observers": (12006, 43),
+    "observers": (12010, 43),
     "policies": (2077, 10),
     "runs": (3573, 13),
     "scenario": (3825, 12),

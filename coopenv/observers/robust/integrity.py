@@ -1,8 +1,8 @@
 """Integrity: one monitor per source of information (landmarks, senders, own sensors), and protection levels.
 
 A fault of a source is an unknown vector f: the offset of a landmark from its place in the map, or of a sender from its
-reported position (m, map), or the error of the own velocity (m/s, body), angular velocity (rad/s, body), camera (a turn
-of its mounting, rad), focal length (a share, the first entry) or initial position (m, body). The own error depends on
+reported position (m, map), or the error of the own velocity (m/s, along it), angular velocity (rad/s, body), camera (a
+turn of its mounting, rad), focal length (a share, the first entry) or initial position (m, body). The own error depends on
 it by a sensitivity Phi, which passes through propagation and correction like the error itself, and an innovation r of
 covariance S by M = H Phi + H_f. The sums A of M^T S^-1 M and a of M^T S^-1 r are the information on all faults.
 
@@ -316,6 +316,10 @@ def end_block(memory: Any, world: int, i: int, time: Any):
                 variance = own_fault_variance(memory, world, i, q)
                 least = wp.float64(1.0) / wp.max(variance, wp.float64(constants.MIN_VARIANCE))
             covariance = wp.inverse(V + least * wp.identity(3, wp.float64))
+            if q == VELOCITY:
+                speed = memory.belief[world, i].mean_v
+                along = speed / wp.max(wp.length(speed), wp.float64(constants.MIN_VELOCITY_STD))
+                covariance = wp.outer(along, along) / (wp.dot(along, V * along) + least)
             memory.source[world, i, q].covariance = covariance
             f = covariance * v
             memory.source[world, i, q].offset = f
