@@ -2,9 +2,9 @@
 
 A fault of a source is an unknown vector f: the offset of a landmark from its place in the map, or of a sender from its
 reported position (m, map), or the error of the own velocity (m/s, along it), angular velocity (rad/s, body), camera (a
-turn of its mounting, rad), focal length (a share, the first entry) or initial position (m, body). The own error depends on
-it by a sensitivity Phi, which passes through propagation and correction like the error itself, and an innovation r of
-covariance S by M = H Phi + H_f. The sums A of M^T S^-1 M and a of M^T S^-1 r are the information on all faults.
+turn of its mounting, rad), focal length (a share, the first entry) or initial position (m, body). The own error depends
+on it by a sensitivity Phi, which passes through propagation and correction like the error itself, and an innovation r
+of covariance S by M = H Phi + H_f. The sums A of M^T S^-1 M and a of M^T S^-1 r are the information on all faults.
 
 Senders have errors within their covariance without a fault. These are eliminated: with the members' covariance P and
 Pi = (P^-1 + A)^-1, the rest for source q is V = A_qq - A_q Pi A_q^T and v = a_q - A_q Pi a. The fault of q is then

@@ -252,8 +252,10 @@ def test_who_is_honest_is_believed(make: Callable[..., Recording], of: tuple[flo
         part = ratio[..., first : first + count]
         assert 0.2 < np.median(part[part > 0.0]) < most
     assert 0.05 < np.median(ratio[..., VELOCITY][ratio[..., VELOCITY] > 0.0]) < most
-    fault = found.source["offset"][-1, :, VELOCITY]
-    assert_allclose(np.cross(fault, found.recording.velocity[-1]), 0.0, atol=0.05 * np.abs(fault).max())
+    recent = found.recording.velocity[-round(MEAN_TIME / found.recording.dt) :]
+    fault, v = found.source["offset"][-1, :, VELOCITY], recent.mean(axis=0)
+    size = np.linalg.norm(fault, axis=1) * np.linalg.norm(v, axis=1)
+    assert np.all(np.linalg.norm(np.cross(fault, v), axis=1) < 0.2 * size)
 
 
 @pytest.mark.parametrize(
