@@ -131,7 +131,7 @@ CHANGES = {
     "none": "",
     "one landmark off by 0.3 m": f"map_error=LANDMARK:0.3,angle={ANGLE}",
     "one landmark off by 3 m": f"map_error=LANDMARK:3.0,angle={ANGLE}",
-    "one landmark off by 3 m from 12 s on": f"map_error=LANDMARK:3.0@{STEP_AT},angle={ANGLE}",
+    "one landmark off by 3 m from 12 s": f"map_error=LANDMARK:3.0@{STEP_AT},angle={ANGLE}",
     "gyro bias steps to 1 deg/s at 12 s": f"gyro_step={np.deg2rad(1.0)}@{STEP_AT}",
     "gyro bias steps to 3 deg/s at 12.27 s": f"gyro_step={np.deg2rad(3.0)}@12.27",
     "cameras turn by 1 deg at 12 s": f"camera_step={np.deg2rad(1.0)}@{STEP_AT}",
