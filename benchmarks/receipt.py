@@ -164,8 +164,8 @@ def changes_of(variant: str) -> list[tuple[Any, str, Any]]:
     """
     from coopenv.observers.robust import constants
 
-    if "*" in variant:
-        name, factor = variant.split("*")
+    name, _, factor = variant.partition("*")
+    if factor and name in numbers():
         return [(constants, name, getattr(constants, name) * float(factor))]
     known, changes = parts(), []
     for part in map(str.strip, variant.split("+")):
@@ -357,7 +357,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         for variant in variants:
             changes_of(variant)
-    except CoopenvError as error:
+    except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     if asked.constants is not None:

@@ -18,6 +18,8 @@ def test_every_part_and_several_together_replace_what_exists() -> None:
     [
         (["--without", "readmision"], "did you mean 'readmission'"),
         (["--without", "prior + focal length"], "cannot be left out together"),
+        (["--without", "gyro bias*2"], "unknown part 'gyro bias*2'"),
+        (["--without", "RISK*two"], "'two'"),
         (["--constants", "RISKY"], "unknown constants RISKY"),
     ],
 )
