@@ -112,8 +112,8 @@ class Frozen:
         if (actions := self.actions.get(about["name"])) is not None:
             source = replace(source, actions=dict(zip(self.seeds, actions.astype(np.float64), strict=True)))
             driven_by = sha256(actions.tobytes()).hexdigest()
-        words = {"title", "description", "source"}
-        world = (variant.scenario or source.scenario).model_dump(mode="json", exclude_unset=True, exclude=words)
+        unused = {"title", "description", "source", "observation", "reward"}  # records do not depend on these
+        world = (variant.scenario or source.scenario).model_dump(mode="json", exclude_unset=True, exclude=unused)
         text = json.dumps([world, driven_by, fault, [*self.seeds]], sort_keys=True)
         return FrozenScene(about["name"], source, variant.name, sha256(text.encode()).hexdigest())
 

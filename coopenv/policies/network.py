@@ -25,8 +25,6 @@ SLACK = 0.01
 """By which entries may lie beyond."""
 FIRST_LOOK = 100
 """Rows, at least, before it does."""
-PLACE = {"start", "stop"}
-"""Properties of a field that may differ between agent and environment."""
 
 
 def layout_tables(layout: Layout) -> tuple[dict[str, NetworkColumn], dict[str, NetworkColumn]]:
@@ -55,7 +53,7 @@ def layout_hash(
 class Network:
     """The mean action of a network that `coopenv train` exported; agrees with torch's to rounding.
 
-    It finds the fields that it was trained with by their names, so that it drives in environments that show more.
+    It finds its fields by their names and reads larger scales as its own: environments may show more than in training.
     """
 
     def __init__(self, scenario: Scenario, *, folder: Path, network: NetworkCard) -> None:
@@ -83,6 +81,9 @@ class Network:
                 raise CoopenvError(f"it was trained with another {key}, {trained!r}, and it is {here!r} here")
         fields = [observation[name] for name in network.observation]
         self._columns = np.concatenate([np.arange(field.start, field.stop) for field in fields])
+        self._factor = np.ones(max(field.stop for field in observation.values()), dtype=np.float32)
+        for own, field in zip(network.observation.values(), fields, strict=True):
+            self._factor[field.start : field.stop] = field.scale / own.scale
         path = folder / network.weights
         if network.layout != layout_hash(network.observation, network.action, network.settings):
             raise CoopenvError(f"{folder / 'agent.toml'}: network.layout is not the hash of its tables")
@@ -99,6 +100,7 @@ class Network:
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return the actions, (rows, A) in [-1, 1], for flat observations, (rows, D)."""
+        observations = np.clip(observations * self._factor, -1.0, 1.0)
         if self._seen:
             self._compare_with_training(observations[observations.any(axis=1)])
         scaled = (observations[:, self._columns] - self._mean) / self._std
@@ -106,8 +108,7 @@ class Network:
         for weight, bias in self._layers[:-1]:
             values = np.tanh(values @ weight + bias)
         weight, bias = self._layers[-1]
-        actions: np.ndarray = np.clip(values @ weight + bias, -1.0, 1.0)
-        return actions
+        return np.asarray(np.clip(values @ weight + bias, -1.0, 1.0))
 
     def _compare_with_training(self, observations: np.ndarray) -> None:
         """Warn, once, where many entries of a field lie beyond those of the training."""
@@ -120,23 +121,22 @@ class Network:
         found = {name: share / self._rows for name, share in self._outside.items() if share > FOREIGN * self._rows}
         if found:
             worst = max(found, key=lambda name: found[name])
-            text = (
-                f"agent {self._name}: {found[worst]:.0%} of the entries of '{worst}' are beyond those of its training"
-            )
-            warnings.warn(AgentWarning(text), stacklevel=2)
+            text = f"{found[worst]:.0%} of the entries of '{worst}' are beyond those of its training"
+            warnings.warn(AgentWarning(f"agent {self._name}: {text}"), stacklevel=2)
             self._seen = {}
 
 
 def _compare(what: str, trained: Mapping[str, NetworkColumn], here: Mapping[str, NetworkColumn]) -> None:
-    """Name the first field that differs; where it stands does not matter, nor what else there is here."""
+    """Name the first field that differs; it may stand elsewhere and have a larger scale, and there may be more here."""
     for name, entry in trained.items():
         before = f"it was trained with another {what}: '{name}'"
         if name not in here:
             raise CoopenvError(f"{before} is not in this environment")
-        then, present = ({"size": c.stop - c.start, **c.model_dump(exclude=PLACE)} for c in (entry, here[name]))
-        for key, value in then.items():
-            now = present[key]
-            if value != now if isinstance(value, str) else not np.isclose(value, now, rtol=1e-9):
+        both = [{"size": c.stop - c.start, **c.model_dump(exclude={"start", "stop"})} for c in (entry, here[name])]
+        for key, value in both[0].items():
+            now = both[1][key]
+            same = value == now if isinstance(value, str) else np.isclose(value, now, rtol=1e-9)
+            if not same and (key != "scale" or now < value):
                 raise CoopenvError(f"{before} had {key} {value!r} and has {now!r} here")
 
 

@@ -87,6 +87,19 @@ def test_drives_where_there_is_more_to_see(tmp_path: Path) -> None:
     assert np.array_equal(wide(np.stack(list(shown.values()))), narrow(np.stack(list(hidden.values()))))
 
 
+def test_reads_larger_scales_as_those_of_its_training(tmp_path: Path) -> None:
+    """What lies beyond the training's scale was clipped there, and is clipped now."""
+    scenario, tensors = coopenv.load_scenario(ENV), tensors_for(132)
+    card, goal = write(tmp_path, tensors), observation_layout(scenario)["goal"]
+    wider = coopenv.load_scenario(ENV, {"observation.scales.goal": 3.0 * goal.scale})
+    here, there = (Network(s, folder=tmp_path, network=card) for s in (scenario, wider))
+    rows = np.random.default_rng(2).uniform(-1, 1, (7, 132)).astype(np.float32)
+    clipped = rows.copy()
+    clipped[:, goal.start : goal.stop] = np.clip(3.0 * rows[:, goal.start : goal.stop], -1.0, 1.0)
+    assert there(rows) == pytest.approx(here(clipped), abs=1e-5)
+    assert np.abs(there(rows) - here(rows)).max() > 1e-3
+
+
 WHOLE = {"observation.include": ["route", "clearance", "uncertainty", "messages", "quality"]}
 SLOW = {**WHOLE, "action.longitudinal": "acceleration"}
 
@@ -96,8 +109,8 @@ SLOW = {**WHOLE, "action.longitudinal": "acceleration"}
     [
         (
             {},
-            {"observation.position_scale": 9.0},
-            r"another observation: 'estimate_position' had scale 8\.0 and has 9\.0",
+            {"observation.position_scale": 7.0},
+            r"another observation: 'estimate_position' had scale 8\.0 and has 7\.0",
         ),
         ({}, {"observation.include": ["odometry", "goal"]}, r"'estimate_position' is not in this environment"),
         ({}, {"dynamics.max_speed": 1.5}, r"another action: 'speed' had high 1\.0 and has 1\.5 here"),
