@@ -153,13 +153,11 @@ LEAST = {
     ("general", "urban_crossing"): 0.8,
     ("behind_truck_quality", "behind_truck"): 0.95,
     ("facade_quality", "facade"): 0.95,
-    ("open_square_quality", "open_square"): 0.75,
+    ("open_square_quality", "open_square"): 0.9,
 }
-"""Share of arrivals in each kind of worlds, but for those in which a vehicle lies."""
+"""Share of arrivals in each kind of worlds."""
 LEAST_AT_THE_WORST = 0.5
 """The same with three times the initial error, all landmarks in one corner, or set back: out of many cameras' range."""
-LEAST_IF_ONE_LIES = 0.65
-"""The same of `general` where a vehicle lies."""
 
 
 @pytest.mark.slow
@@ -167,14 +165,11 @@ LEAST_IF_ONE_LIES = 0.65
 def test_learned_agents_arrive_whatever_they_sense(agent: str, environment: str) -> None:
     contest = Contest.of(environment, {}, [agent], 64, 9, stressed=True)
     found = {name: {r.metric: r.mean for r in results} for name, results in contest.drive().results.items()}
-    arrived = {name: rates["arrival_rate"] for name, rates in found.items() if not name.endswith(" lies")}
+    arrived = {name: rates["arrival_rate"] for name, rates in found.items()}
     hard = ("initial error x 3", "in one corner", "as far out")
     hardest = [arrived.pop(name) for name in [*arrived] if name.endswith(hard)]
     assert min(hardest) >= LEAST_AT_THE_WORST, found
     assert len(arrived) > 8 and min(arrived.values()) >= LEAST[agent, environment], arrived
-    if agent == "general":
-        lied = [rates["arrival_rate"] for name, rates in found.items() if name.endswith(" lies")]
-        assert min(lied, default=1.0) >= LEAST_IF_ONE_LIES, lied
 
 
 @pytest.mark.slow
