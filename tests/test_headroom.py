@@ -155,9 +155,11 @@ LEAST = {
     ("facade_quality", "facade"): 0.95,
     ("open_square_quality", "open_square"): 0.9,
 }
-"""Share of arrivals in each kind of worlds."""
+"""Share of arrivals in each kind of worlds, but for those in which a vehicle lies."""
 LEAST_AT_THE_WORST = 0.5
 """The same with three times the initial error, all landmarks in one corner, or set back: out of many cameras' range."""
+LEAST_IF_ONE_LIES = 0.8
+"""The same where a vehicle lies."""
 
 
 @pytest.mark.slow
@@ -168,7 +170,8 @@ def test_learned_agents_arrive_whatever_they_sense(agent: str, environment: str)
     arrived = {name: rates["arrival_rate"] for name, rates in found.items()}
     hard = ("initial error x 3", "in one corner", "as far out")
     hardest = [arrived.pop(name) for name in [*arrived] if name.endswith(hard)]
-    assert min(hardest) >= LEAST_AT_THE_WORST, found
+    lied = [arrived.pop(name) for name in [*arrived] if name.endswith(" lies")]
+    assert min(hardest) >= LEAST_AT_THE_WORST and min(lied, default=1.0) >= LEAST_IF_ONE_LIES, found
     assert len(arrived) > 8 and min(arrived.values()) >= LEAST[agent, environment], arrived
 
 
