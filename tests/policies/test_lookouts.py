@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coopenv import parallel_env
 from coopenv.api.terms.layout import observation_layout
 from coopenv.policies import act, load_agent
 from coopenv.policies.look_ahead import LookAhead, TeamLookAhead
@@ -148,6 +149,23 @@ def test_neither_driving_nor_small_corrections_are_leaps() -> None:
     for k in range(40):
         x, y = np.array([3.0 - 0.05 * k, 0.1 * k - 3.0]) + rng.uniform(-0.3, 0.3, 2)
         assert not driver.leaps(observation(**other(x, y, 1.6), velocity=[0.5, 0.0, 0.0])).any()
+
+
+def test_leaps_of_the_farthest_senders_are_seen_in_the_open_square() -> None:
+    """What lies beyond the scale of its entry is clipped there, and shows no leap."""
+    env = parallel_env("open_square")
+    observations, _ = env.reset(seed=0)
+    for _ in range(5):  # until messages arrive
+        observations, *_ = env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
+    rows, layout = np.stack(list(observations.values())), observation_layout(env.scenario)
+    there = layout["message_mask"].values(rows) > 0.5
+    place = layout["message_position"]
+    entries = np.abs(rows[:, place.start : place.stop]).reshape(len(rows), -1, 2)[there]
+    assert 0.5 < entries.max() < 1.0
+    driver = RouteFollower(env.scenario)
+    driver(rows)
+    rows[:, place.start : place.stop] *= 0.6
+    assert np.array_equal(driver.leaps(rows).reshape(*there.shape, 2).any(axis=-1), there)
 
 
 @pytest.mark.parametrize(("away", "speed"), [(2.0, 0.0), (4.8, 1.0)])
