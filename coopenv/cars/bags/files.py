@@ -1,28 +1,40 @@
-"""Bags as files: ROS 1 `.bag`, ROS 2 folders, bare `.db3` and `.mcap`; types and decoding by rosbags."""
+"""Bags as files: ROS 1 `.bag`, ROS 2 folders, bare `.db3` and `.mcap`."""
 
-import struct
+from __future__ import annotations
+
 import tempfile
 import warnings
-from collections.abc import Callable, Collection, Iterator
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
+from heapq import merge
 from importlib.util import find_spec
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.backends.mcap_format import REPAIR
-from coopenv.base.errors import CoopenvError, DataError, DataWarning, error_text
+from coopenv.backends.mcap_format import MAGIC, REPAIR, metadata_names
+from coopenv.base.errors import CoopenvError, DataError, DataWarning, error_text, listed, printable
 from coopenv.base.installation import install_command
-from coopenv.cars import codec
+
+if TYPE_CHECKING:
+    from coopenv.cars.bags.definitions import BagChannel
+    from coopenv.cars.bags.streams import Part
 
 METADATA, PACKED = "metadata.yaml", ".zstd"
+OURS = "coopenv"
+"""Name of the metadata of recordings."""
 
-REPAIRS = {".bag": "rosbag reindex", ".db3": "sqlite3 FILE .recover", ".mcap": REPAIR}
-"""Repair tool for a bag with a truncated recording, by the suffix of the file."""
+REPAIRS = {
+    ".bag": (b"#ROSBAG V2.0", "rosbag reindex"),
+    ".db3": (b"SQLite format 3", "sqlite3 FILE .recover"),
+    ".mcap": (MAGIC, REPAIR),
+}
+"""First bytes of a bag, and the repair tool for one with a truncated recording, by the suffix of the file."""
 
 LATEST = 4 * 10**18  # ns, in 2096: sums of two such times fit into 64 bits
 
@@ -49,17 +61,23 @@ class BagFile:
         if not self._files and not any(part.name == METADATA for part in inside):
             raise DataError(f"{path}: a folder without {METADATA}, which a bag of ROS 2 has")
         try:
-            self._reader = self._open()
-            self._complete_types()
-            self.topics = {name: info.msgtype or "" for name, info in self._reader.topics.items()}
-            """Type of every topic; empty where messages of several types came on it."""
-            self.counts = {name: int(info.msgcount) for name, info in self._reader.topics.items()}
-            self.seconds = max(0.0, (self._reader.end_time - self._reader.start_time) * 1e-9)
-            """Between its first and its last message."""
+            self._parts = self._opened()
         except Exception as error:  # any error of the library at a malformed file
             self._stack.close()
             raise error if isinstance(error, CoopenvError) else self._unreadable(error) from None
-        self._warn_damaged()
+        counts = sum((part.counts for part in self._parts), Counter())
+        self.channels = frozenset(channel for channel in counts if channel.readable)
+        self.topics: dict[str, str] = {}
+        """Type of every topic that can be read; empty where messages of several types came on it."""
+        self.counts = Counter[str]()
+        for channel in sorted(self.channels):
+            same = self.topics.get(channel.topic, channel.kind) == channel.kind
+            self.topics[channel.topic] = channel.kind if same else ""
+            self.counts[channel.topic] += counts[channel]
+        begin, end = min(part.start_time for part in self._parts), max(part.end_time for part in self._parts)
+        self.seconds = max(0.0, (end - begin) * 1e-9)
+        """Between its first and its last message."""
+        self._warn(sorted({printable(f"{c.topic} ({c.encoding})") for c in counts if not c.readable}))
 
     def __enter__(self) -> Self:
         """Return the bag."""
@@ -69,23 +87,20 @@ class BagFile:
         """Close the file."""
         self._stack.close()
 
-    def _open(self) -> Any:
-        """Return the reader of rosbags, with streams of the files in place of its own readers."""
-        from rosbags.highlevel import AnyReader
-
+    def _opened(self) -> list[Part]:
+        """Return the files with messages. Raises an error of the libraries, or that of a file without any message."""
         from coopenv.cars.bags.streams import Part
 
         files = [self._unpacked(file) if file.suffix == PACKED else file for file in self._files]
         if not files:
             raise ValueError("no file with messages is beside its metadata")
-        store = codec.ros1() if files[0].suffix == ".bag" else codec.ros2()
-        reader: Any = AnyReader(files, default_typestore=store)
-        reader.readers = self._parts = [Part(file) for file in files]
-        self._stack.enter_context(reader)
-        error = next((part.error for part in self._parts if part.error), None)
-        if error is not None and not any(connection.msgcount for connection in reader.connections):
+        if any(file.suffix == ".mcap" and OURS in (metadata_names(file) or ()) for file in files):
+            raise DataError(f"{self.path}: no bag; coopenv run reads a recording of coopenv")
+        parts = [Part(file) for file in files]
+        error = next((part.error for part in parts if part.error), None)
+        if error is not None and not any(part.counts.total() for part in parts):
             raise error
-        return reader
+        return parts
 
     def _unpacked(self, file: Path) -> Path:
         """Return a copy of a packed file that is unpacked, until the bag is closed. Raises TooLargeError."""
@@ -101,71 +116,70 @@ class BagFile:
                 out.write(data)
         return place
 
-    def _complete_types(self) -> None:
-        """Add the definitions that are ours to give and that the bag lacks."""
-        store, known = self._reader.typestore, codec.ros1() if not self._reader.is2 else codec.ros2()
-        wanted = {connection.msgtype for connection in self._reader.connections}
-        if wanted - set(store.fielddefs):
-            store.register({kind: known.fielddefs[kind] for kind in known.fielddefs if kind not in store.fielddefs})
-
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Callable[[], Any]]]:
         """Yield topic, time of reception (ns, recorder's clock) and decoder of messages of some topics, as they stand.
 
-        Those of a file that breaks off, or a part of which is damaged, are those before; a DataWarning was given.
+        Messages of a file that breaks off, or a part of which is damaged, are those before; a DataWarning was given.
+        The decoder raises CoopenvError: the message makes no sense.
         """
-        for connection, received, data in self._raw(topics):
-            yield connection.topic, received, partial(self._decode, data, connection.msgtype)
+        from coopenv.cars.bags.definitions import decode
+
+        for channel, received, data in self._raw(topics):
+            yield channel.topic, received, partial(decode, channel, data)
 
     def times(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
         """Return stamps (0: none) and times of reception (n,), ns, of the messages of every topic."""
+        from coopenv.cars.bags.definitions import stamp
+
         found: dict[str, list[tuple[int, int]]] = {name: [] for name in self.topics}
-        fields = self._reader.typestore.fielddefs
-        headed = {
-            kind: "std_msgs/msg/Header" in str(fields[kind][1][:1]) for kind in self.topics.values() if kind in fields
-        }
-        for connection, received, data in self._raw(self.topics):
-            stamp = 0
-            if headed.get(connection.msgtype) and len(data) >= 12:  # after 4 bytes: encapsulation, or seq of ROS 1
-                order = "<" if data[1] & 1 or not self._reader.is2 else ">"
-                seconds, nanoseconds = struct.unpack_from(f"{order}II", data, 4)
-                stamp = seconds * 10**9 + nanoseconds
-            found[connection.topic].append((stamp, received))
+        for channel, received, data in self._raw(self.topics):
+            found[channel.topic].append((stamp(channel, data), received))
         ordered = {name: sorted(rows, key=itemgetter(1)) for name, rows in found.items()}
         tables = {name: np.array(rows, np.int64).reshape(-1, 2).T for name, rows in ordered.items()}
         return {name: (stamps, received) for name, (stamps, received) in tables.items()}
 
-    def _raw(self, topics: Collection[str]) -> Iterator[tuple[Any, int, bytes]]:
-        connections = [c for c in self._reader.connections if c.topic in topics]
-        for connection, received, data in self._reader.messages(connections) if connections else ():
-            if 0 <= received < LATEST:
-                yield connection, received, data
-            else:
-                text = f"topic {connection.topic}: messages are left out that were received after 2096"
-                warnings.warn(f"{self.path}: {text}", DataWarning, stacklevel=3)
+    def _raw(self, topics: Collection[str]) -> Iterator[tuple[BagChannel, int, bytes]]:
+        from coopenv.backends.mcap_container import TooLargeError
 
-    def _warn_damaged(self) -> None:
+        wanted = {channel for channel in self.channels if channel.topic in topics}
+        parts = [part.messages(wanted) for part in self._parts] if wanted else []
+        try:
+            for channel, received, data in merge(*parts, key=itemgetter(1)):
+                if 0 <= received < LATEST:
+                    yield channel, received, data
+                else:
+                    text = f"topic {channel.topic}: messages are left out that were received after 2096"
+                    warnings.warn(f"{self.path}: {text}", DataWarning, stacklevel=3)
+        except TooLargeError as error:
+            raise DataError(f"{self.path}: {error}") from None
+
+    def _warn(self, others: Sequence[str]) -> None:
+        """Warn of parts that are damaged, and of channels that are left out because of their encoding.
+
+        Raises DataError: there are no other channels.
+        """
         for part in self._parts:
             if part.error is not None:
                 seconds = max(0.0, (part.end_time - part.start_time) * 1e-9)
                 text = f"damaged after {seconds:.1f} s ({error_text(part.error)}); what came before it is used"
                 warnings.warn(f"{self.path}: {text}", DataWarning, stacklevel=3)
-
-    def _decode(self, data: bytes, kind: str) -> Any:
-        """Return a message of a type. Raises CoopenvError: it makes no sense."""
-        try:
-            return self._reader.deserialize(data, kind)
-        except Exception as error:
-            raise CoopenvError(f"{kind}: cannot be read ({type(error).__name__})") from None
+        text = f"left out, since their messages have no encoding of ROS (cdr, ros1): {listed(others)}"
+        if others and not self.channels:
+            raise DataError(f"{self.path}: no topics of ROS; {text}")
+        if others:
+            warnings.warn(f"{self.path}: {text}", DataWarning, stacklevel=3)
 
     def _unreadable(self, error: Exception) -> DataError:
         from coopenv.backends.mcap_container import TooLargeError
 
         if isinstance(error, TooLargeError):
             return DataError(f"{self.path}: {error}")
-        repair = next((REPAIRS[file.suffix] for file in self._files if file.suffix in REPAIRS), None)
-        hint = f"; if its recording was cut off, `{repair}` mends it" if repair else ""
-        if repair == REPAIR:
-            hint += "; coopenv run reads a recording of coopenv"
+        hint = ""
+        for file in self._files:
+            begin, repair = REPAIRS.get(file.suffix, (b"", ""))
+            with file.open("rb") as stream:
+                if repair and stream.read(len(begin)) == begin:
+                    hint = f"; if its recording was cut off, `{repair}` mends it"
         return DataError(f"{self.path}: cannot be read as a ROS bag ({error_text(error)}){hint}")
 
 

@@ -1,77 +1,69 @@
 """The messages of bag files in the order of the file, without an index, within limits of their unpacked size.
 
-`Part` takes the place of the readers of rosbags. So a file whose recording broke off is read as far as it goes: it may
-break off within a chunk, of which what can be unpacked counts as well.
+A file whose recording broke off is read as far as it goes: it may break off within a chunk, of which what can be
+unpacked counts as well. Channels that are not read have no effect on the others, whatever their encoding and contents.
 """
 
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
-from io import SEEK_CUR, BytesIO
+from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO
 
 import apsw
-from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat, TopicInfo
-from rosbags.rosbag1.reader import Header, RecordType, normalize, read_uint32
-from rosbags.typesys.msg import normalize_msgtype
 
 from coopenv.backends import mcap_container as container
 from coopenv.backends.mcap_container import Allowance, TooLargeError, messages_of, records_of
 from coopenv.backends.mcap_format import MAGIC, is_cut_off
 from coopenv.base.errors import regular
+from coopenv.cars.bags.definitions import ROS1, BagChannel
 
-FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
 ENDS_EARLY = "its end is missing"
 ZSTD = b"\x28\xb5\x2f\xfd"
-"""Begin of a packed message; one of CDR begins with 0."""
+"""Begin of a packed message; a message of CDR begins with 0."""
+MOST_CHANNELS = 2**16  # as many as an MCAP file has numbers for
+IN_MEMORY = 512  # bytes that a message takes at least once it is decoded
 
-About = tuple[str, str, str, str]
-Entries = Iterator[tuple[About, int, bytes | None]]
-"""Messages: (topic, type, encoding of its definition, definition), time of reception (ns), bytes; None: a topic."""
+Entries = Iterator[tuple[BagChannel, int, bytes | None]]
+"""Messages: channel, time of reception (ns), bytes; None: the channel alone."""
 
 
 class Part:
-    """A file, as the readers of rosbags."""
+    """A file of a bag."""
 
     def __init__(self, path: Path) -> None:
-        """Take a file that ends with .bag, .db3 or .mcap."""
+        """Go through a file once that ends with .bag, .db3 or .mcap. Raises TooLargeError: it unpacks to too much."""
         self.path = path
         self.start_time, self.end_time = 2**63 - 1, 0
         self.error: Exception | None = None
         """Why it is read no further than it is."""
-
-    def __enter__(self) -> Self:
-        """Go through the file once. Raises TooLargeError: it unpacks to too much."""
-        counts: Counter[About] = Counter()
-        for about, received, data in self._entries():
-            counts[about] += data is not None
+        self.counts: Counter[BagChannel] = Counter()
+        """Messages of every channel."""
+        for channel, received, data in self._entries():
+            self.counts[channel] += data is not None
             if data is not None:
                 self.start_time, self.end_time = min(self.start_time, received), max(self.end_time, received)
-        ext: Any = None
-        self.connections = []
-        for number, ((topic, kind, encoding, text), count) in enumerate(counts.items()):
-            definition = MessageDefinition(FORMATS.get(encoding, MessageDefinitionFormat.NONE), text)
-            self.connections.append(Connection(number, topic, kind, definition, "", count, ext, self))
-        self.topics = {c.topic: TopicInfo(c.msgtype, c.msgdef, c.msgcount, [c]) for c in self.connections}
-        return self
 
-    def __exit__(self, *unused: object) -> None:
-        """Nothing is open."""
+    def messages(self, wanted: Collection[BagChannel]) -> Iterator[tuple[BagChannel, int, bytes]]:
+        """Yield channel, time of reception (ns) and bytes of the messages of some channels.
 
-    def messages(self, connections: Collection[Any], **unused: object) -> Iterator[tuple[Any, int, bytes]]:
-        """Yield connection, time of reception (ns) and bytes of messages."""
-        wanted = {(c.topic, c.msgtype): c for c in connections}
-        for about, received, data in self._entries():
-            if data is not None and (connection := wanted.get(about[:2])) is not None:
-                yield connection, received, data
+        Raises TooLargeError: the messages take too much memory.
+        """
+        allowance = Allowance(self.path.stat().st_size)
+        for channel, received, data in self._entries():
+            if data is not None and channel in wanted:
+                allowance.take(IN_MEMORY)
+                yield channel, received, _unpacked(data, allowance) if data[:4] == ZSTD else data
 
     def _entries(self) -> Entries:
         """Yield messages up to where the file makes no sense."""
         allowance = Allowance(self.path.stat().st_size)
         try:
-            for about, received, data in FORMS[self.path.suffix](self.path, allowance):
-                yield about, received, allowance.unpack("zstd", data) if data and data[:4] == ZSTD else data
+            for entry in FORMS[self.path.suffix](self.path, allowance):
+                if len(self.counts) > MOST_CHANNELS:
+                    raise TooLargeError(f"has more than {MOST_CHANNELS} topics")
+                yield entry
             if self.path.suffix == ".mcap" and is_cut_off(self.path):
                 raise EOFError(ENDS_EARLY)
         except (TooLargeError, apsw.TooBigError) as error:
@@ -80,16 +72,38 @@ class Part:
             self.error = error
 
 
+def _unpacked(data: bytes, allowance: Allowance) -> bytes:
+    """Return a packed message; an empty one if it is damaged. Raises TooLargeError."""
+    try:
+        return allowance.unpack("zstd", data)
+    except TooLargeError:
+        raise
+    except Exception:  # any error of the library at malformed bytes
+        return b""
+
+
+def _channel(topic: bytes, kind: bytes, encoding: str, language: str = "", definition: bytes = b"") -> BagChannel:
+    """Return a channel by its texts; the full name of the type sensor_msgs/Imu is sensor_msgs/msg/Imu."""
+    name, about, text = (part.decode(errors="replace") for part in (topic, kind, definition))
+    package, _, last = about.rpartition("/")
+    full = f"{package}/msg/{last}" if package and "/" not in package else about
+    return BagChannel(name, full, encoding if full else "no type", language, text)
+
+
 def _of_mcap(path: Path, allowance: Allowance) -> Entries:
     with regular(path).open("rb") as stream:
         if stream.read(len(MAGIC)) != MAGIC:
             raise ValueError("not an MCAP file")
         records = records_of(stream, max(container.AT_ONCE, path.stat().st_size), allowance)
+        known: dict[int, BagChannel] = {}
         for channel, schema, message in messages_of(records):
-            if schema is None or channel.message_encoding != "cdr":
-                raise ValueError(f"{channel.topic}: no messages of ROS 2 with their type")
-            about = channel.topic, schema.name, schema.encoding, schema.data.decode()
-            yield about, message.log_time if message else 0, message.data if message else None
+            if message is None:
+                name, language, text = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
+                about = channel.topic.encode(), name.encode(), channel.message_encoding, language, text
+                known[channel.id] = _channel(*about)
+                yield known[channel.id], 0, None
+            else:
+                yield known[channel.id], message.log_time, message.data
 
 
 class _File(apsw.VFSFile):
@@ -114,7 +128,7 @@ class _Files(apsw.VFS):
         return _File("", name, flags)
 
 
-def _of_sqlite3(path: Path, _: Allowance) -> Entries:
+def _of_sqlite3(path: Path, allowance: Allowance) -> Entries:
     files, flags = _Files(), apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
     database = apsw.Connection(f"{path.absolute().as_uri()}?immutable=1", flags=flags, vfs=VFS)
     database.limit(apsw.SQLITE_LIMIT_LENGTH, container.AT_ONCE)
@@ -123,58 +137,77 @@ def _of_sqlite3(path: Path, _: Allowance) -> Entries:
         for name, kind, text in database.execute("SELECT name, type, sql FROM sqlite_schema WHERE type != 'index'"):
             if name.lower() in TABLES and (kind != "table" or "VIRTUAL" in text.upper()):
                 raise ValueError(f"{name} is no table")  # but a query, which may have no end
-        texts: dict[str, tuple[str, str]] = {}
+        texts: dict[bytes, tuple[str, bytes]] = {}
         if database.table_exists(None, "message_definitions"):
-            query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-            texts = {kind: (encoding, text) for kind, encoding, text in database.execute(query)}
+            columns = "CAST(topic_type AS BLOB), encoding, CAST(encoded_message_definition AS BLOB)"
+            rows = database.execute(f"SELECT {columns} FROM message_definitions")
+            texts = {kind: (language, text or b"") for kind, language, text in rows}
         topics = {}
-        for key, name, kind in database.execute("SELECT id, name, type FROM topics"):
-            topics[key] = about = (name, kind, *texts.get(kind, ("", "")))
-            yield about, 0, None
+        columns = "id, CAST(name AS BLOB), CAST(type AS BLOB), serialization_format"
+        for key, name, kind, encoding in database.execute(f"SELECT {columns} FROM topics"):
+            topics[key] = _channel(name or b"", kind or b"", encoding, *texts.get(kind, ()))
+            yield topics[key], 0, None
         valid = "typeof(data) = 'blob' AND typeof(timestamp) = 'integer'"  # others are damaged
         query = f"SELECT topic_id, timestamp, data FROM messages WHERE {valid} ORDER BY id"
         for topic, received, data in database.execute(query):
-            yield topics[topic], received, data
+            allowance.take(len(data))
+            if topic in topics:
+                yield topics[topic], received, data
     finally:
         database.close()
         files.unregister()
 
 
 def _of_ros1(path: Path, allowance: Allowance) -> Entries:
-    known: dict[int, About] = {}
+    known: dict[int, BagChannel] = {}
     with regular(path).open("rb") as stream:
         if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
             raise ValueError("no bag of ROS 1")
         for header, data in _ros1_records(stream, allowance):
-            number = header.get_uint32("conn")
-            if header.get_uint8("op") == RecordType.CONNECTION:
-                about = Header.read(BytesIO(struct.pack("<I", len(data)) + data))
-                kind = normalize_msgtype(about.get_string("type"))
-                topic, text = normalize(header.get_string("topic")), about.get_string("message_definition")
-                known[number] = topic, kind, "ros2msg", text
+            (number,) = struct.unpack("<I", header[b"conn"])
+            if header[b"op"] == CONNECTION:
+                about = _ros1_header(data)
+                topic = b"/" + b"/".join(part for part in header[b"topic"].split(b"/") if part)
+                text = about.get(b"message_definition", b"")
+                known[number] = _channel(topic, about.get(b"type", b""), ROS1, "ros1msg", text)
                 yield known[number], 0, None
-            else:
-                yield known[number], header.get_time("time"), data
+            elif number in known:
+                seconds, nanoseconds = struct.unpack("<II", header[b"time"])
+                yield known[number], seconds * 10**9 + nanoseconds, data
 
 
-def _ros1_records(stream: BinaryIO, allowance: Allowance) -> Iterator[tuple[Any, bytes]]:
+MESSAGE, CHUNK, CHUNK_INFO, CONNECTION = b"\x02", b"\x05", b"\x06", b"\x07"
+"""Kinds of the records of ROS 1."""
+
+
+def _ros1_header(data: bytes) -> dict[bytes, bytes]:
+    """Return the fields of a record's header."""
+    fields, at = {}, 0
+    while at < len(data):
+        (size,) = struct.unpack_from("<I", data, at)
+        name, _, value = data[at + 4 : at + 4 + size].partition(b"=")
+        fields[name], at = value, at + 4 + size
+    return fields
+
+
+def _ros1_records(stream: BinaryIO, allowance: Allowance) -> Iterator[tuple[dict[bytes, bytes], bytes]]:
     """Yield header and data of connections and messages, also of the chunk in which a file breaks off.
 
     Raises EOFError: it breaks off, or has not the table of chunks that is written last.
     """
     chunks = 0  # that are not in that table
-    while stream.read(1):
-        stream.seek(-1, SEEK_CUR)
-        header = Header.read(stream)
-        op, size = header.get_uint8("op"), read_uint32(stream)
+    while size := stream.read(4):
+        header = _ros1_header(stream.read(*struct.unpack("<I", size)))
+        op, (size,) = header[b"op"], struct.unpack("<I", stream.read(4))
         data = stream.read(size)
-        chunks += (op == RecordType.CHUNK) - (op == RecordType.CHUNK_INFO)
-        if op == RecordType.CHUNK:
-            unpacked = allowance.unpack(header.get_string("compression"), data, header.get_uint32("size"))
+        chunks += (op == CHUNK) - (op == CHUNK_INFO)
+        if op == CHUNK:
+            (claimed,) = struct.unpack("<I", header[b"size"])
+            unpacked = allowance.unpack(header[b"compression"].decode(), data, claimed)
             yield from _ros1_records(BytesIO(unpacked), allowance)
         if len(data) < size:
             break
-        if op in (RecordType.CONNECTION, RecordType.MSGDATA):
+        if op in (CONNECTION, MESSAGE):
             yield header, data
     else:
         if not chunks:
