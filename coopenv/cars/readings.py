@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.cars.codec import numbers_after_header
 from coopenv.cars.profile import GATE_TYPES, MOST_CHANNELS, CarProfile, MotionCommand, Role, VisionSettings
-from coopenv.cars.vision import BEARINGS, FINDERS, UNIT, Calibration, Tag
+from coopenv.cars.vision import BEARINGS, FINDERS, Calibration, Tag
 from coopenv.estimation.poses import Array, log_so3
 from coopenv.observers.contract import Message
 from coopenv.scenario import sensing
@@ -85,21 +85,30 @@ def numbers_of(values: Any, field: str, most: float) -> Array:
     return numbers
 
 
-def covariance_of(values: Any, field: str) -> Array:
-    """Return (6, 6) numbers whose diagonal is not negative and that are symmetric."""
-    matrix = numbers_of(values, field, 1e12).reshape(6, 6)
-    if not matrix.any():  # often: not known
-        return matrix
-    if (matrix.diagonal() < 0.0).any() or (np.abs(matrix - matrix.T) > 1e-9 + 1e-6 * np.abs(matrix.T)).any():
-        raise CoopenvError(f"{field}: is no covariance (symmetric, no negative variance)")
-    return matrix
+ASYMMETRY = 1e-3
+"""Tolerance of a covariance's symmetry, in shares of its standard deviations; single precision is within it."""
+
+
+def covariance_of(values: Any) -> Array | None:
+    """Return a covariance (6, 6); None: it is not known. Zeros, -1, NaN, and what is no covariance mean that."""
+    matrix = np.array(values, dtype=np.float64).reshape(6, 6)
+    diagonal = matrix.diagonal()
+    if not (np.abs(matrix) <= 1e12).all() or not matrix.any() or (diagonal < 0.0).any():
+        return None
+    deviations = np.sqrt(diagonal)
+    alike = np.abs(matrix - matrix.T) <= ASYMMETRY * np.outer(deviations, deviations)
+    return 0.5 * (matrix + matrix.T) if alike.all() else None
+
+
+LENGTH = 0.05
+"""Tolerance of the length of a quaternion, which is normalised."""
 
 
 def rotation_of(quaternion: Any, field: str) -> Array:
-    """Return the rotation matrix (3, 3) of a message's quaternion. Raises CoopenvError: its length is not 1."""
+    """Return the rotation matrix (3, 3) of a message's quaternion. Raises CoopenvError: its length is far from 1."""
     wxyz = [float(getattr(quaternion, part)) for part in "wxyz"]
     length = math.hypot(*wxyz)
-    if not abs(length - 1.0) <= UNIT:
+    if not abs(length - 1.0) <= LENGTH:
         raise CoopenvError(f"{field}: no unit quaternion, its length is {length:.6g}")
     return sensing.rotation_of(None, wxyz)
 
@@ -140,15 +149,16 @@ def calibration_of(message: Any, rectified: bool = False) -> Calibration:
     size = (int(message.width), int(message.height))
     if not all(0 < side <= 100_000 for side in size):
         raise CoopenvError(f"width, height: {size} is no image")
-    if message.distortion_model not in LENSES:
-        raise CoopenvError(f"distortion_model: {shown(message.distortion_model)} is none of {listed(list(LENSES))}")
     matrix = numbers_of(getattr(message, "k", getattr(message, "K", ())), "k", 1e6)
     given = numbers_of(getattr(message, "d", getattr(message, "D", ())), "d", 1e6)
+    model = message.distortion_model if given.any() else ""  # without distortion its name says nothing
+    if model not in LENSES:
+        raise CoopenvError(f"distortion_model: {shown(model)} is none of {listed(list(LENSES))}")
     if matrix.shape != (9,) or min(matrix[0], matrix[4]) <= 0.0 or matrix[1] != 0.0:
         raise CoopenvError("k: no camera matrix with two positive focal lengths and no skew")
-    count = LENSES[message.distortion_model]
+    count = LENSES[model]
     if given[count:].any() or (given.size < count and given.size not in (0, 4)):
-        raise CoopenvError(f"d: {given.size} numbers, {message.distortion_model or 'plumb_bob'} has {count}")
+        raise CoopenvError(f"d: {given.size} numbers, {model or 'plumb_bob'} has {count}")
     bent = (*map(float, given[:count]), *[0.0] * (count - given.size))
     focal, centre = (float(matrix[0]), float(matrix[4])), (float(matrix[2]), float(matrix[5]))
     if rectified:
@@ -224,7 +234,7 @@ def read(
 
 
 def _twist(message: Any) -> Twist:
-    """Return the velocities of a TwistWithCovarianceStamped; a negative variance means not measured."""
+    """Return the velocities of a TwistWithCovarianceStamped or Odometry; a negative variance means not measured."""
     with_covariance = message.twist
     linear, angular = _velocities(with_covariance.twist)
     variances = np.asarray(with_covariance.covariance, dtype=np.float64).reshape(6, 6).diagonal()
@@ -243,9 +253,8 @@ def _turning(message: Any) -> Twist:
 
 
 def _pose_with_covariance(message: Any) -> CarPose:
-    """Return the pose of a PoseWithCovarianceStamped or Odometry; a covariance of zeros means unknown."""
-    covariance = covariance_of(message.pose.covariance, "pose.covariance")
-    return replace(_placed(message.pose.pose), covariance=covariance if covariance.any() else None)
+    """Return the pose of a PoseWithCovarianceStamped or Odometry."""
+    return replace(_placed(message.pose.pose), covariance=covariance_of(message.pose.covariance))
 
 
 def _placed(pose: Any) -> CarPose:
@@ -266,7 +275,9 @@ def _report(message: Any) -> Message:
         "ages": np.zeros(0, np.float32),
         "correlations": np.zeros((0, 6, 6), np.int8),
     }
-    return Message(pose.position, pose.rotation, covariance_of(message.covariance, "covariance"), extra)
+    if (covariance := covariance_of(message.covariance)) is None:
+        raise CoopenvError("covariance: is no covariance (symmetric, no negative variance)")
+    return Message(pose.position, pose.rotation, covariance, extra)
 
 
 POSES: dict[str, Callable[[Any], Value]] = {
@@ -277,7 +288,7 @@ POSES: dict[str, Callable[[Any], Value]] = {
 TWISTS: dict[str, Callable[[Any], Value]] = {
     "geometry_msgs/msg/TwistWithCovarianceStamped": _twist,
     "geometry_msgs/msg/TwistStamped": lambda message: Twist(*_velocities(message.twist)),
-    "nav_msgs/msg/Odometry": lambda message: Twist(*_velocities(message.twist.twist)),  # in the child frame
+    "nav_msgs/msg/Odometry": _twist,  # in the child frame
 }
 READERS: dict[Role, dict[str, Callable[..., Value]]] = {
     Role.DETECTIONS: {kind: tags for kind in FINDERS if kind != BEARINGS},

@@ -66,7 +66,7 @@ def ray_of(calibration: Calibration, u: int, v: int) -> tuple[float, float, floa
 
 
 UNIT = 1e-3
-"""Tolerance of the length of a unit quaternion or bearing; single precision and rounded decimals are within it."""
+"""Tolerance of the length of a bearing; single precision and rounded decimals are within it."""
 
 
 class Tag(NamedTuple):
@@ -131,9 +131,12 @@ def _frame(message: Any, settings: VisionSettings, camera: Calibration) -> list[
 
 
 def _apriltags(message: Any, _settings: VisionSettings, camera: Calibration) -> list[Tag]:
-    """Return the detections of an AprilTagDetectionArray; its centres are the projection's."""
+    """Return the detections of an AprilTagDetectionArray; its centres are the projection's.
+
+    AprilTag's library counts pixels from the corner of the first one, CameraInfo from its middle.
+    """
     found = [
-        (d.id, np.ptp([p.x for p in d.corners]) * np.ptp([p.y for p in d.corners]), d.centre.x, d.centre.y)
+        (d.id, np.ptp([p.x for p in d.corners]) * np.ptp([p.y for p in d.corners]), d.centre.x - 0.5, d.centre.y - 0.5)
         for d in message.detections
     ]
     return _centred(found, camera)

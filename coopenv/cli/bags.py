@@ -15,7 +15,7 @@ from coopenv.cli.run import check_log
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from coopenv.cars.bags.log import TopicRow
+    from coopenv.cars.bags.topics import TopicRow
     from coopenv.cars.calibration import Calibrated, ConstantRow
 
 
@@ -45,8 +45,8 @@ def import_(
                 f"{'--out' if out else '--override'}: needs the map of the bags' topics, --map topics.toml"
             )
         from coopenv.base.files import check_file, check_new, replace_text
-        from coopenv.cars.bags.bag import examined, proposed
         from coopenv.cars.bags.files import BagFile
+        from coopenv.cars.bags.topics import examined, proposed
 
         if propose is not None:
             check_new(propose, force)

@@ -3,11 +3,9 @@
 A map gives car and content of each topic; one is proposed by the topics' types.
 """
 
-import re
+import math
 import warnings
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,17 +14,16 @@ import numpy as np
 
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
 from coopenv.backends.worlds import without_robots
-from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning, check_one_of, listed, printable
-from coopenv.cars.backend.assembler import BROADCAST, Assembler
+from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning, check_one_of, listed
+from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.binding import OPTIONS, bind, marker_places, reset_options
-from coopenv.cars.bags.clocks import checked, misfit_of_truth
-from coopenv.cars.bags.files import BagFile, check_extra
-from coopenv.cars.bags.log import NS, TopicRow, read_log, regularity
-from coopenv.cars.bags.topic_map import READ, UNNEEDED, TopicMap, load_map
-from coopenv.cars.profile import IMAGES, SVEA, VELOCITY, Role
-from coopenv.cars.readings import POSES, READERS, CarPose, Sample, read
-from coopenv.cars.sensor_settings import TOPIC
-from coopenv.cars.vision import Calibration
+from coopenv.cars.bags.clocks import misfit_of_truth
+from coopenv.cars.bags.files import check_extra
+from coopenv.cars.bags.log import read_log
+from coopenv.cars.bags.topic_map import UNNEEDED, TopicMap, load_map
+from coopenv.cars.bags.topics import NS
+from coopenv.cars.profile import Role
+from coopenv.cars.readings import CarPose, Sample
 from coopenv.estimation.poses import MISFIT_DEG
 from coopenv.scenario import Scenario, load_scenario
 
@@ -91,6 +88,7 @@ class Bag(TickGenerator):
         check_extra()
         self.map = topics if isinstance(topics, TopicMap) else load_map(topics)
         self.changes = changes = {**ENDLESS, **self.map.overrides, **(overrides or {})}
+        changes |= self._decisions(changes)
         self.where = ", ".join(str(path) for path in paths)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ScenarioWarning)  # repeated below
@@ -108,6 +106,14 @@ class Bag(TickGenerator):
         super().__init__(scenario, Capabilities(known, False, False, ticks, False, True, here))
         for note in (*self.log.notes, *self._odd_rates(), *self._odd_markers(), *self._far_truth()):
             warnings.warn(f"{self.where}: {note}", DataWarning, stacklevel=2)
+
+    def _decisions(self, changes: Mapping[str, Any]) -> dict[str, float]:
+        """Return the rate of decisions, which a recording has not, such that the camera's may be any."""
+        rate = changes.get("rates.camera")
+        if not isinstance(rate, int | float) or rate <= 0.0 or "rates.decision" in changes:
+            return {}
+        decision = load_scenario(self.map.environment_path).rates.decision
+        return {"rates.decision": rate / math.ceil(rate / decision - 1e-9)}
 
     def _kept(self, robots: Sequence[str] | None) -> tuple[int, ...]:
         """Return the vehicles of some cars; None: of all."""
@@ -158,7 +164,7 @@ class Bag(TickGenerator):
     def _odd_rates(self) -> Iterator[str]:
         for row in self.log.rows:
             if row.role in (Role.DETECTIONS, Role.BEARINGS) and row.rate and abs(row.rate / self._rate - 1.0) > OFF:
-                hint = f'set overrides = {{ "rates.camera" = {row.rate:.0f}.0 }} in the map'
+                hint = f'set overrides = {{ "rates.camera" = {float(f"{row.rate:.3g}")} }} in the map'
                 yield f"{row.topic}: {row.rate:.1f} frames per second, the environment has {self._rate:g}: {hint}"
 
     def _far_truth(self) -> Iterator[str]:
@@ -210,118 +216,3 @@ class Bag(TickGenerator):
 def _used(sample: Sample) -> int:
     """Return when a sample is put in, ns."""
     return sample.stamp - AHEAD if sample.role is Role.TRUTH else sample.stamp
-
-
-CAPTURE = re.compile(r"qualisys|mocap|vicon|optitrack|vrpn|truth|ground", re.IGNORECASE)
-"""Pattern in names of topics of motion capture."""
-COMMANDED = re.compile(r"cmd|command|setpoint|target", re.IGNORECASE)
-"""Pattern in names of topics of commands, whose types are those of measured twists."""
-ANY_CAMERA = Calibration((100_000, 100_000), (1e5, 1e5), (5e4, 5e4), (0.0,) * 5)
-"""Intrinsics for which every detection is inside the image."""
-TO_WHEELS = (SVEA.topics[Role.MANUAL].type,)
-DRIFTING = 1e-5  # s per s from which a clock's drift is mentioned
-
-
-def examined(files: Sequence[BagFile]) -> tuple[tuple[TopicRow, ...], tuple[str, ...]]:
-    """Return a row per topic, and what is wrong with stamps, a line each."""
-    times = [file.times() for file in files]
-    rows, notes = [], list[str]()
-    for name in sorted({name for found in times for name in found}):
-        kind = next(file.topics[name] for file in files if name in file.topics)
-        parts = [found[name] for found in times if name in found]
-        received = np.sort(np.concatenate([received for _, received in parts]))
-        rate, gap, gaps = regularity(received)
-        wrong, offset = 0, None
-        for stamps, arrived in parts:
-            bad, delay = checked(stamps, arrived)
-            if delay is None:
-                continue
-            wrong, offset = wrong + int(bad.sum()), delay.offset / NS
-            if not stamps.all():
-                notes.append(f"{name}: {int((stamps == 0).sum())} of {len(stamps)} stamps are 0")
-            if abs(delay.drift) > DRIFTING:
-                notes.append(f"{name}: its clock drifts by {1e6 * delay.drift:+.0f} us per s")
-            if delay.jump:
-                notes.append(f"{name}: its clock jumps by {delay.jump / NS:.2g} s")
-        if wrong:
-            notes.append(f"{name}: {wrong} of {len(received)} stamps are wrong, and will be left out")
-        rows.append(TopicRow(name, kind, len(received), rate, gap=gap, gaps=gaps, offset=offset, outlying=wrong))
-    return tuple(rows), tuple(notes)
-
-
-def proposed(files: Sequence[BagFile], rows: Sequence[TopicRow]) -> str:
-    """Return a map of bags with such topics, as TOML text. Raises CoopenvError: no topic has detections of a camera."""
-    cars = cars_of(rows)
-    used = {name for topics in cars.values() for name in topics.values()}
-    markers = ", ".join(f"{number} ({count} frames)" for number, count in sorted(_markers(files, used).items()))
-    none = "images ([vision]: their tags)" if any(r.type in IMAGES and r.topic in used for r in rows) else "no marker"
-    lines = [
-        "# Proposed by names and types of topics: check every line.",
-        'environment = "my_environment.toml" # landmarks, camera, noise: a name (coopenv list), or a file beside this',
-        'names = "none"',
-        f"# The camera has seen {markers or none}.",
-        "markers = {} # numbers by name of the landmark: { SL1 = 1 }",
-    ]
-    for car, topics in cars.items():
-        lines += ["", "[[cars]]", f'name = "{car}"', "# marker = 7 # its own, seen by other cars"]
-        lines += ['# vehicle = "vehicle_1" # of the environment (default: in the order of this file)', "[cars.topics]"]
-        lines += [f'{role.value} = "{name}"' for role, name in topics.items()]
-    kinds = [row for row in rows if row.topic not in used]
-    lines += ["", "# Not used:", *(printable(f"#   {row.topic} ({row.type})") for row in kinds)] if kinds else []
-    return "\n".join(lines) + "\n"
-
-
-def cars_of(rows: Sequence[TopicRow]) -> dict[str, dict[Role, str]]:
-    """Return the topics by role of every car with a camera, by the part of the names that differs between cars."""
-    roles = {row.topic: role for row in rows if (role := role_of(row)) is not None}
-    cameras = next((t for r in (Role.DETECTIONS, Role.BEARINGS) if (t := [n for n in roles if roles[n] is r])), [])
-    if not cameras:
-        kinds = ", ".join(kind for role in (Role.DETECTIONS, Role.BEARINGS) for kind in READERS[role])
-        raise CoopenvError(f"no map can be proposed: no topic has detections of a camera ({kinds})")
-    found: dict[str, dict[Role, str]] = {}
-    for car, names in _owned(cameras, roles):
-        best = sorted((row for row in rows if row.topic in names), key=lambda row: row.messages)
-        by_role = {roles[row.topic]: row.topic for row in best}
-        found[car] = {role: by_role[role] for role in READ if role in by_role and role not in BROADCAST}
-    return found
-
-
-def _owned(cameras: Sequence[str], roles: Mapping[str, Role]) -> Iterator[tuple[str, set[str]]]:
-    """Yield cars and their topics: those that have the name of the car as a part."""
-    parts = [camera.split("/") for camera in cameras]
-    if len(cameras) > 1:
-        place = next(k for k in range(max(map(len, parts))) if len({tuple(p[k : k + 1]) for p in parts}) > 1)
-        for own in parts:
-            yield _name(own[place]), {name for name in roles if own[place] in name.split("/")}
-        return
-    moving = [name.split("/") for name, role in roles.items() if any(role in some for some in VELOCITY.values())]
-    shared = [part for k, part in enumerate(parts[0]) if any(other[: k + 1] == parts[0][: k + 1] for other in moving)]
-    yield _name(shared[-1] if shared else ""), set(roles)
-
-
-def _name(part: str) -> str:
-    """Return a name of a car."""
-    text = re.sub(r"\W", "_", part)
-    return text if text[:1].isalpha() else f"car_{text}".rstrip("_")
-
-
-def role_of(row: TopicRow) -> Role | None:
-    """Return the role of a topic by its type, and by its name where that leaves several."""
-    if COMMANDED.search(row.topic) or not re.match(TOPIC, row.topic):
-        return None
-    if row.type in POSES and CAPTURE.search(row.topic):
-        return Role.TRUTH
-    order = (Role.ODOMETRY, *READ) if row.type == "nav_msgs/msg/Odometry" else (Role.WHEEL, *READ)
-    return next((role for role in order if role in READ and row.type in READERS.get(role, TO_WHEELS)), None)
-
-
-def _markers(files: Sequence[BagFile], used: set[str]) -> Counter[int]:
-    """Return in how many frames each marker was detected on the topics that are used. Images are not searched."""
-    found: Counter[int] = Counter()
-    for file in files:
-        for role in (Role.DETECTIONS, Role.BEARINGS):
-            kinds = READERS[role].keys() - IMAGES
-            for _, _, decode in file.messages([name for name in used if file.topics.get(name) in kinds]):
-                with suppress(CoopenvError):
-                    found.update(getattr(read(role, decode(), ANY_CAMERA), "markers", ()))
-    return found

@@ -310,7 +310,7 @@ def leads_of(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Bindi
         moved = {role: _cumulated(tracks_of(own[role], start)) for role in topics if role in ODOMETRY}
         truth = _path(tracks_of(own[Role.TRUTH], start)) if Role.TRUTH in topics else None
         camera = next(role for role in CAMERAS if role in topics)
-        seen = _azimuths(own[camera], start, binding, vehicle)
+        seen = azimuths_of(own[camera], start, binding, vehicle)
         place = np.array(binding.scenario.cameras[vehicle].position[:2])
         leads: dict[Role, Lead | None] = {}
         if truth is not None:
@@ -347,7 +347,7 @@ def _path(tracks: Mapping[str, Any]) -> tuple[SampledSignal, SampledSignal, Samp
     return SampledSignal(t, np.concatenate([[0.0], np.cumsum(forward)])), SampledSignal(t, heading), path
 
 
-def _azimuths(samples: Sequence[Sample], start: int, binding: Binding, vehicle: int) -> tuple[Array, Array, Array]:
+def azimuths_of(samples: Sequence[Sample], start: int, binding: Binding, vehicle: int) -> tuple[Array, Array, Array]:
     """Return times (n,), azimuths (n,) in the body frame, and positions (n, 2) of standing landmarks in view."""
     landmarks, led = binding.scenario.landmarks, binding.leaders.values()
     marks = {number: k for number, k in binding.targets.items() if k < len(landmarks) and k not in led}
@@ -361,7 +361,7 @@ def misfit_of_truth(samples: Sequence[Sample], car: str, binding: Binding) -> fl
     start = samples[0].stamp if samples else 0
     path = _path(tracks_of([s for s in samples if (s.car, s.role) == (car, Role.TRUTH)], start))
     seen = [s for s in samples if s.car == car and s.role in CAMERAS]
-    times, azimuths, places = _azimuths(seen, start, binding, binding.cars[car])
+    times, azimuths, places = azimuths_of(seen, start, binding, binding.cars[car])
     if path is None:
         return math.nan
     x, y, heading = path[2].over(times, times, level=True).T

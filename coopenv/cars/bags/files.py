@@ -37,6 +37,7 @@ REPAIRS = {
 """First bytes of a bag, and the repair tool for one with a truncated recording, by the suffix of the file."""
 
 LATEST = 4 * 10**18  # ns, in 2096: sums of two such times fit into 64 bits
+YEAR = 10**9 * 86_400 * 365  # ns
 
 
 class BagFile:
@@ -77,6 +78,8 @@ class BagFile:
         begin, end = min(part.start_time for part in self._parts), max(part.end_time for part in self._parts)
         self.seconds = max(0.0, (end - begin) * 1e-9)
         """Between its first and its last message."""
+        self.dated = end > YEAR
+        """Whether messages were received by a clock that was set, so that 0 is no time."""
         self._warn(sorted({printable(f"{c.topic} ({c.encoding})") for c in counts if not c.readable}))
 
     def __enter__(self) -> Self:

@@ -24,18 +24,21 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, listed
 from coopenv.cars.backend.binding import Binding
-from coopenv.cars.bags.clocks import Delay, Leads, checked, jumps, leads_of, moves_of
+from coopenv.cars.bags.clocks import CAMERAS, Delay, Leads, azimuths_of, checked, jumps, leads_of, moves_of
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TRUTH, Chosen, ClockSettings, MapFrame, TopicMap, select
+from coopenv.cars.bags.topics import NS, TopicRow, regularity, unread_truth
 from coopenv.cars.codec import encode, stamp_of
 from coopenv.cars.gate import read_drive
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.readings import tracks_of as motions_of
 from coopenv.cars.sensor_settings import Correction
+from coopenv.cars.turning import constant_turn_rate
 from coopenv.cars.vision import Calibration
 from coopenv.scenario.sensing import rotation_of
 
-NS, IMU = 1_000_000_000, "sensor_msgs/msg/Imu"
+IMU = "sensor_msgs/msg/Imu"
 
 Delays = Mapping[str, int]
 """ns by which each source of a file is behind its recorder."""
@@ -137,23 +140,25 @@ def value_reader(
 
 def _published(files: Sequence[BagFile], chosen: Collection[Chosen], given: TopicMap) -> dict[str, Calibration]:
     """Return the first calibration of each car that publishes one."""
-    found: dict[str, Calibration] = {}
+    cars, found = {e.topic: e.car for e in chosen if e.role is Role.CAMERA_INFO}, dict[str, Calibration]()
     for file in files:
-        for entry in chosen:
-            if entry.role is not Role.CAMERA_INFO or entry.car in found:
+        left = cars.keys() & file.topics.keys()
+        for topic, _, decode in file.messages(frozenset(left)) if left else ():
+            if topic not in left:
                 continue
-            for _, _, decode in file.messages([entry.topic]):
-                try:
-                    message = decode()
-                    if not np.any(getattr(message, "k", getattr(message, "K", 1.0))):
-                        text = f"{file.path}: topic {entry.topic}: says that the camera is not calibrated (k is zero)"
-                        warnings.warn(f"{text}; the environment's calibration counts", DataWarning, stacklevel=4)
-                        break
+            left.remove(topic)
+            try:
+                message = decode()
+                if np.any(getattr(message, "k", getattr(message, "K", 1.0))):
                     value = read(Role.CAMERA_INFO, message, vision=given.vision)
-                except CoopenvError as error:
-                    raise DataError(f"{file.path}: topic {entry.topic}: {error}") from None
-                if isinstance(value, Calibration):
-                    found[entry.car] = value
+                    if isinstance(value, Calibration):
+                        found.setdefault(cars[topic], value)
+                else:
+                    text = f"{file.path}: topic {topic}: says that the camera is not calibrated (k is zero)"
+                    warnings.warn(f"{text}; the environment's calibration counts", DataWarning, stacklevel=4)
+            except CoopenvError as error:
+                raise DataError(f"{file.path}: topic {topic}: {error}") from None
+            if not left:
                 break
     return found
 
@@ -181,6 +186,14 @@ class Track:
     outlying: int = 0  # messages that were dropped for their stamps
     delay: Delay | None = None  # None: no message with a stamp
     source: str = ""  # source of the stamps' clock
+
+    def date_undated(self) -> None:
+        """Let messages whose time of reception is 0, before the recorder's clock was set, be received as the others."""
+        dated = [entry for entry in self.entries if entry.received]
+        usual = int(np.median([entry.received - entry.stamp for entry in dated if entry.stamp] or [0]))
+        early = [replace(e, received=e.stamp + usual) for e in self.entries if not e.received and e.stamp]
+        self.refused["received at 0, without a stamp"] += len(self.entries) - len(dated) - len(early)
+        self.refused, self.entries = +self.refused, early + dated
 
     def clean_stamps(self, mode: str) -> None:
         """Drop messages with wrong stamps, after jumps of the clock if a mode removes them; measure the delay."""
@@ -240,6 +253,8 @@ def tracks_of(
         except (AttributeError, TypeError, ValueError) as error:  # a definition with other fields than ours
             track.refused[f"{file.topics[topic]} has other fields than expected ({error})"] += 1
     for track in tracks.values():
+        if file.dated:
+            track.date_undated()
         track.clean_stamps(clocks.mode)
     return list(tracks.values())
 
@@ -262,26 +277,6 @@ def delays_of(tracks: Sequence[Track], files: int, tolerance: float, stated: Col
             if known:
                 found[file][name] = min([delay for delay in known if delay >= -tolerance] or known)
     return [*found]
-
-
-@dataclass(frozen=True)
-class TopicRow:
-    """A topic; unknown values are None."""
-
-    topic: str
-    type: str
-    messages: int
-    rate: float | None  # Hz
-    car: str | None = None  # that it was read for
-    role: str | None = None
-    used: int | None = None  # messages
-    gap: float | None = None  # s, the longest between two
-    gaps: int | None = None  # pauses of more than three times the usual period
-    offset: float | None = None  # s by which its stamps are behind the recorder's clock, transport included
-    outlying: int | None = None  # messages that were dropped for their stamps
-    lead: float | None = None  # s by which its stamps are early, by what it measures
-    lead_error: float | None = None  # s, standard error
-    reference: str | None = None  # reference of their lead
 
 
 def rows_of(
@@ -314,14 +309,6 @@ def rows_of(
         by_content = () if lead is None else (lead.seconds, lead.error, lead.reference)
         rows.append(TopicRow(name, kind, count, rate, *read, *by_content))
     return tuple(rows)
-
-
-def regularity(stamps: np.ndarray) -> tuple[float | None, float | None, int | None]:
-    """Return the rate in Hz, the longest gap in s and the number of gaps over three median periods of stamps in ns."""
-    steps = np.diff(stamps) * 1e-9
-    if not len(steps) or steps.sum() <= 0.0:
-        return None, None, None
-    return float(len(steps) / steps.sum()), float(steps.max()), int((steps > 3.0 * np.median(steps)).sum())
 
 
 @dataclass(frozen=True)
@@ -364,6 +351,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         unknown = Counter[int]()
         value, mode = value_reader(given, binding, chosen, lenses, unknown), given.clocks.mode
         tracks = [track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, given.clocks)]
+        unread = [*unread_truth(files, given, chosen)]
     known = sorted(entry.topic for entry in chosen)
     for key in ("offsets", "leads"):
         if odd := [name for name in getattr(given.clocks, key) if name[0] == "/" and name not in known]:
@@ -390,6 +378,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         and (unread := [name for name, kind in topics.items() if kind == IMU and name not in used])
     ):
         notes.append(f"turn rates of {listed(cars)} are the wheels'; unread: {listed(unread)}, of type {IMU}")
+    notes += [*_turn_notes(samples, chosen, binding), *unread]
     rays = {entry.car for entry in chosen if entry.role is Role.BEARINGS and not given.distorted}
     pixels = {name: lens for name, lens in lenses.items() if name not in rays}
     added: dict[tuple[str, Role], tuple[str, float]] = {}
@@ -454,6 +443,18 @@ def _notes(tracks: Sequence[Track], clocks: Clocks, given: TopicMap, drifts: Map
     for track in tracks if given.clocks.mode != "received" else ():
         if not all(entry.stamp for entry in track.entries):
             yield f"topic {track.chosen.topic}: messages without stamps count when they were received"
+
+
+def _turn_notes(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Binding) -> Iterator[str]:
+    """Yield notes on turn rates that never change although the car turns."""
+    for car, vehicle in binding.cars.items():
+        own = [sample for sample in samples if sample.car == car]
+        topics = {entry.role: entry.topic for entry in chosen if entry.car == car}
+        seen = azimuths_of([s for s in own if s.role in CAMERAS], samples[0].stamp, binding, vehicle) if own else None
+        wheelbase = binding.scenario.limits[vehicle].wheelbase
+        if seen and (why := constant_turn_rate(motions_of(own, samples[0].stamp), seen, wheelbase)):
+            topic = next(topics[role] for role in (Role.IMU, Role.ODOMETRY, Role.WHEEL) if role in topics)
+            yield f"topic {topic}: the turn rate of {car} {why}"
 
 
 def _lead_notes(

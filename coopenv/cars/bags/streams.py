@@ -42,7 +42,7 @@ class Part:
         """Messages of every channel."""
         for channel, received, data in self._entries():
             self.counts[channel] += data is not None
-            if data is not None:
+            if data is not None and received:  # 0: before the recorder's clock was set
                 self.start_time, self.end_time = min(self.start_time, received), max(self.end_time, received)
 
     def messages(self, wanted: Collection[BagChannel]) -> Iterator[tuple[BagChannel, int, bytes]]:

@@ -22,7 +22,8 @@ from coopenv.bench.observers import sources
 from coopenv.cars import codec
 from coopenv.cars.backend.drive import DriveRecorder
 from coopenv.cars.bags.bag import Bag
-from coopenv.cars.bags.log import Shift, reconcile, recorders, regularity
+from coopenv.cars.bags.log import Shift, reconcile, recorders
+from coopenv.cars.bags.topics import regularity
 from coopenv.cli.app import main
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Sensed

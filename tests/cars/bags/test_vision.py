@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coopenv import CoopenvError
-from coopenv.cars.bags.bag import Bag, examined, proposed
+from coopenv.cars.bags.bag import Bag
 from coopenv.cars.bags.files import BagFile
+from coopenv.cars.bags.topics import examined, proposed
 from coopenv.cars.codec import make
 from coopenv.cars.frames import FrameRenderer, PlacedTag
 from coopenv.cars.profile import Role, VisionSettings

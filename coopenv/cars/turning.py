@@ -1,0 +1,73 @@
+"""Turn rates that never change while something else shows that the car turns: a dead gyro, wheels that measure none."""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from coopenv.estimation.poses import Array
+
+TURNED = math.radians(20.0)  # of a car, by anything else than its turn rate
+WINDOW, NOISE = 0.4, math.radians(2.0)
+"""s over which bearings are compared, and rad by which they change for another reason than a turn."""
+
+
+def constant_turn_rate(
+    tracks: Mapping[str, Any], sightings: tuple[Array, Array, Array], wheelbase: float
+) -> str | None:
+    """Return in words what contradicts a turn rate that is the same in all samples; None: nothing does.
+
+    Args:
+        tracks: of a car, see `coopenv.cars.readings.tracks_of`.
+        sightings: times (n,), s, azimuths (n,), rad, in the body frame and positions (n, 2) of standing landmarks.
+        wheelbase: of the car, m.
+    """
+    rates = tracks["gyro"]
+    if len(rates) < 2 or np.ptp(rates) > 0.0:
+        return None
+    rate, deg = float(rates[0]), math.degrees
+    found = [f"{name} by {deg(turn):.0f} deg" for name, turn in _turns(tracks, sightings, wheelbase, rate)]
+    if not found:
+        return None
+    return f"is {rate:g} rad/s in all {len(rates)} messages, while {' and '.join(found)}"
+
+
+def _turns(
+    tracks: Mapping[str, Any], sightings: tuple[Array, Array, Array], wheelbase: float, rate: float
+) -> Iterator[tuple[str, float]]:
+    """Yield what turns by more than `TURNED`, beyond a constant rate (rad/s), and by how much (rad)."""
+    heading = np.unwrap(tracks["truth_yaw"]) - rate * tracks["truth_time"]
+    commanded = _commanded(tracks, wheelbase, rate)
+    for name, turn in (
+        ("motion capture turns it", float(np.ptp(heading)) if len(heading) else 0.0),
+        ("commands turn it", float(np.ptp(commanded)) if len(commanded) else 0.0),
+        ("bearings turn it", _inwards(*sightings, tracks) if rate == 0.0 else 0.0),
+    ):
+        if turn > TURNED:
+            yield name, turn
+
+
+def _commanded(tracks: Mapping[str, Any], wheelbase: float, rate: float) -> Array:
+    """Return the heading (n,) by the commanded steering and the speed of the wheels, less that of a constant rate."""
+    t = tracks["command_time"]
+    if not len(t) or not len(tracks["wheel_time"]):
+        return np.zeros(0)
+    speed = np.interp(t, tracks["wheel_time"], tracks["wheel"].real, left=0.0, right=0.0)
+    turning = speed[:-1] * np.tan(tracks["command_steering"][:-1]) / wheelbase - rate
+    return np.concatenate([[0.0], np.cumsum(turning * np.minimum(np.diff(t), WINDOW))])
+
+
+def _inwards(times: Array, azimuths: Array, places: Array, tracks: Mapping[str, Any]) -> float:
+    """Return by how much a landmark comes nearer to the axis of a car's motion, rad: without a turn none does."""
+    most = 0.0
+    for place in np.unique(places, axis=0):
+        own = (places == place).all(axis=1)
+        t, azimuth = times[own], np.unwrap(azimuths[own])
+        grid = np.arange(t[0], t[-1], WINDOW)
+        near = np.abs(t[np.clip(np.searchsorted(t, grid), 0, len(t) - 1)] - grid) < WINDOW / 2
+        at = np.where(near, np.interp(grid, t, azimuth), np.nan)
+        forwards = np.interp(grid[1:], tracks["wheel_time"], tracks["wheel"].real) if len(tracks["wheel"]) else 0.0
+        nearer = -np.diff(at) * np.sign(np.sin(at[:-1])) * np.where(np.asarray(forwards) < 0.0, -1.0, 1.0)
+        most = max(most, float(np.nansum(np.maximum(nearer - NOISE, 0.0))))
+    return most
