@@ -24,7 +24,7 @@ SQUARE = [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)]
 NO_NUMBER = [{"hypothesis": {"class_id": "chair", "score": 1.0}}]
 LIVE: dict[str, dict[str, Any]] = {
     "apriltag_msgs/msg/AprilTagDetectionArray": {
-        "detections": [{"id": n, "centre": pixel, "corners": SQUARE} for n, pixel in PIXELS.items()]
+        "detections": [{"id": n, "centre": (u + 0.5, v + 0.5), "corners": SQUARE} for n, (u, v) in PIXELS.items()]
     },
     "vision_msgs/msg/Detection2DArray": {
         "detections": [
@@ -42,7 +42,7 @@ LIVE: dict[str, dict[str, Any]] = {
         "markers": [{"id": n, "pose": {"pose": {"position": 3.0 * ray}}, "confidence": 1.0} for n, ray in RAYS.items()]
     },
 }
-"""Fields of messages by type."""
+"""Fields of messages by type; AprilTag's library counts from the corner of the first pixel, not from its middle."""
 
 
 def assert_rays_of_the_pixels(found: Any) -> None:

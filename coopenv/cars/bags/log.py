@@ -351,7 +351,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         unknown = Counter[int]()
         value, mode = value_reader(given, binding, chosen, lenses, unknown), given.clocks.mode
         tracks = [track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, given.clocks)]
-        unread = [*unread_truth(files, given, chosen)]
+        elsewhere = [*unread_truth(files, given, chosen)]
     known = sorted(entry.topic for entry in chosen)
     for key in ("offsets", "leads"):
         if odd := [name for name in getattr(given.clocks, key) if name[0] == "/" and name not in known]:
@@ -378,7 +378,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         and (unread := [name for name, kind in topics.items() if kind == IMU and name not in used])
     ):
         notes.append(f"turn rates of {listed(cars)} are the wheels'; unread: {listed(unread)}, of type {IMU}")
-    notes += [*_turn_notes(samples, chosen, binding), *unread]
+    notes += [*_turn_notes(samples, chosen, binding), *elsewhere]
     rays = {entry.car for entry in chosen if entry.role is Role.BEARINGS and not given.distorted}
     pixels = {name: lens for name, lens in lenses.items() if name not in rays}
     added: dict[tuple[str, Role], tuple[str, float]] = {}

@@ -403,6 +403,42 @@ def test_a_camera_with_another_rate_is_reported(tmp_path: Path) -> None:
         opened(tmp_path, MAP.replace("[overrides]", '[overrides]\n"rates.camera" = 30.0\n"rates.observer" = 30.0'))
 
 
+def test_the_rate_of_a_camera_may_be_any(tmp_path: Path) -> None:
+    """The environment's decisions are 20 Hz; a recording has none."""
+    for rate in (15.0, 50.0, 59.4):
+        bag = opened(
+            tmp_path / str(rate), MAP.replace('"rates.odometry"', f'"rates.camera" = {rate}\n"rates.odometry"')
+        )
+        assert bag.scenario.rates.camera == rate and bag.capabilities.ticks == pytest.approx(0.5 * rate, abs=3)
+
+
+def test_messages_that_came_before_the_recorders_clock_was_set_count(tmp_path: Path) -> None:
+    """Their time of reception is 0; their stamps are right."""
+    sent = longer(2)
+    early = [replace(m, received=-bags.BEGIN) if m.stamp < 500_000_000 else m for m in sent]
+    for form in ("ros1", "mcap"):
+        whole, found = (opened(tmp_path / f"{form}{k}", MAP, drive, form) for k, drive in enumerate((sent, early)))
+        assert found.capabilities.ticks == whole.capabilities.ticks
+        assert len(found.log.samples) == len(whole.log.samples)
+
+
+def test_a_turn_rate_that_is_always_0_is_named(tmp_path: Path) -> None:
+    """Motion capture turns by 57 deg; see `tests/cars/test_turning.py` for bearings and commands."""
+
+    def turning(m: bags.Message) -> bags.Message:
+        pose = {"pose": codec.pose(exp_so3(np.array([0.0, 0.0, 0.25e-9 * m.stamp])), (0.0, 0.0, 0.0))}
+        return replace(m, fields=pose) if "qualisys" in m.topic else m
+
+    def dead(m: bags.Message) -> bags.Message:
+        still = {"twist": (m.fields["twist"]["twist"][0], (0.0, 0.0, 0.0))} if "twist" in m.topic else {}
+        return replace(m, fields={"twist": still}) if still else m
+
+    drive = [*map(turning, bags.sent())]
+    assert not [line for line in warned(tmp_path / "sound", MAP, drive) if "turn rate" in line]
+    [line] = [line for line in warned(tmp_path / "dead", MAP, [*map(dead, drive)]) if "turn rate" in line]
+    assert re.search(r"actuation_twist: .* of svea3 is 0 rad/s in all \d+ messages, while motion .* by 57 deg$", line)
+
+
 def test_a_bag_is_no_scenario() -> None:
     with pytest.raises(CoopenvError, match=r"drive\.bag: a ROS bag is no scenario; .* run BAG --map topics.toml"):
         load_scenario("drive.bag")

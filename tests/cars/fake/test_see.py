@@ -250,7 +250,7 @@ def test_stamps_of_another_detector_are_moved_to_the_exposure_on_the_way_to_the_
     scenario = Eyes().scenario
     intake = Intake(bind(scenario, OVERTAKING, MARKERS, "test", None, profile), Sensors())
     square = [(u, v) for u, v in ((300.0, 180.0), (340.0, 180.0), (340.0, 220.0), (300.0, 220.0))]
-    found = [{"id": 4, "centre": (320.0, 200.0), "corners": square}]
+    found = [{"id": 4, "centre": (320.5, 200.5), "corners": square}]
     message = make(topic["type"], header=header(10**9), detections=[make(KIND, **tag) for tag in found])
     [sample] = intake.samples(Arrival("fleet/svea7/tags", encode(message), 10**9 + 1))
     assert sample.stamp == 10**9 + 10_000_000 + 2_000_000 and sample.value.markers == (4,)

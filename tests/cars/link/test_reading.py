@@ -143,15 +143,70 @@ def test_poses_and_points() -> None:
     assert isinstance(reading, CarPose) and reading.position.tolist() == [1, 2, 3] and reading.rotation is None
 
 
+def skew(value: float) -> Any:
+    """Return the covariance of standard deviations 1, 2, ... that is asymmetric by a value in one place."""
+    covariance = np.diag(np.arange(1.0, 7.0) ** 2)
+    covariance[0, 5] += value
+    return covariance
+
+
+UNKNOWN = {
+    "zeros": np.zeros(36),
+    "-1": [-1.0, *np.zeros(35)],
+    "negative": -np.eye(6),
+    "NaN": np.full(36, np.nan),
+    "NaN within": np.diag([1, 1, 1, 1, 1, np.nan]),
+    "infinite": np.diag([1, 1, 1, 1, 1, np.inf]),
+    "asymmetric": skew(0.3),
+}
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+@pytest.mark.parametrize("kind", ["nav_msgs/msg/Odometry", ESTIMATE])
+def test_a_pose_counts_whatever_its_covariance(kind: str, name: str) -> None:
+    message = make(kind, pose=pose(covariance=UNKNOWN[name]))
+    for role in (Role.TRUTH, Role.ESTIMATE):
+        value = read(role, message)
+        assert isinstance(value, CarPose) and value.covariance is None and value.position.tolist() == [1, 2, 3]
+
+
+def test_a_covariance_that_is_symmetric_but_for_rounding_is_symmetric() -> None:
+    value = read(Role.ESTIMATE, make(ESTIMATE, pose=pose(covariance=skew(5e-3))))
+    assert isinstance(value, CarPose)
+    assert_allclose(value.covariance, 0.5 * (skew(5e-3) + skew(5e-3).T), atol=1e-15)
+
+
+@pytest.mark.parametrize("length", [0.96, 1.0, 1.04])
+def test_quaternions_a_few_per_cent_long_are_normalised(length: float) -> None:
+    turn = Rotation.from_rotvec([0.3, -0.2, 2.0])
+    value = read(Role.TRUTH, posed((1, 2, 3), length * turn.as_quat()))
+    assert isinstance(value, CarPose) and value.rotation is not None
+    assert_allclose(value.rotation, turn.as_matrix(), atol=1e-12)
+
+
+def test_velocities_that_an_odometry_does_not_measure_are_none() -> None:
+    unmeasured = {"twist": ((2, 0, 0), (0, 0, 0)), "covariance": np.diag([1, 1, 1, 1, 1, -1.0])}
+    value = read(Role.WHEEL, make("nav_msgs/msg/Odometry", pose=pose(), twist=unmeasured))
+    assert isinstance(value, Twist) and value.angular is None and value.linear is not None
+
+
+REPORT = "coopenv_msgs/msg/RobustReport"
+
+
+def report(covariance: Any) -> dict[str, Any]:
+    """Return the fields of a report with a covariance."""
+    return {"pose": ((1, 2, 3), (0, 0, 0, 1)), "odometry": ((4, 5, 6), (0, 0, 0, 1)), "covariance": covariance}
+
+
 def test_reports() -> None:
     turn = Rotation.from_rotvec([0.1, 0.0, -3.0])
     fields = {"pose": ((1, 2, 3), turn.as_quat()), "covariance": np.eye(6)}
     fields |= {"odometry": ((4, 5, 6), -turn.as_quat()), "depends_on": 2**63 + 1}
-    value = read(Role.REPORT, make("coopenv_msgs/msg/RobustReport", valid=True, **fields))
+    value = read(Role.REPORT, make(REPORT, valid=True, **fields))
     assert isinstance(value, Message) and value.rotation is not None
     assert_allclose(value.extra["odometry"], [*turn.as_rotvec(), 4, 5, 6], atol=1e-12)
     assert value.extra["depends_on"].dtype == np.uint64 and int(value.extra["depends_on"][0]) == 2**63 + 1
-    lost = read(Role.REPORT, make("coopenv_msgs/msg/RobustReport", valid=False, **fields))
+    lost = read(Role.REPORT, make(REPORT, valid=False, **fields))
     assert lost == Message()
 
 
@@ -165,7 +220,8 @@ def camera_info(ros: int, **other: Any) -> Any:
 def test_calibrations(ros: int) -> None:
     expected = Calibration((316, 208), (213.0, 214.0), (155.0, 115.0), DISTORTION)
     assert read(Role.CAMERA_INFO, camera_info(ros)) == expected
-    assert read(Role.CAMERA_INFO, camera_info(ros, d=[])) == replace(expected, distortion=(0.0,) * 5)
+    for none in ({"d": []}, {"d": [0.0] * 5, "distortion_model": "none"}, {"d": [], "distortion_model": "pinhole"}):
+        assert read(Role.CAMERA_INFO, camera_info(ros, **none)) == replace(expected, distortion=(0.0,) * 5)
 
 
 def battery(share: float) -> Any:
@@ -196,7 +252,12 @@ WRONG: list[tuple[Role, Any, str]] = [
     ),
     (Role.TRUTH, lambda: posed((0, np.inf, 0), (0, 0, 0, 1)), "truth: pose.position: "),
     (Role.TRUTH, lambda: imu(), "truth: type 'sensor_msgs/msg/Imu' is none of geometry_msgs/msg/PoseStamped"),
-    (Role.ESTIMATE, lambda: make(ESTIMATE, pose=pose(covariance=-np.eye(6))), "estimate: pose.covariance: "),
+    (Role.TRUTH, lambda: posed((1, 2, 3), (0, 0, 0, 1.1)), "truth: pose.orientation: .* its length is 1.1"),
+    (
+        Role.REPORT,
+        lambda: make(REPORT, valid=True, **report(-np.eye(6))),
+        "report: covariance",
+    ),
     (Role.DETECTIONS, lambda: blocks((1, 5, 5, 1, 1)), "detections: the camera's calibration is not known"),
     (Role.CAMERA_INFO, lambda: camera_info(2, distortion_model="wide"), "camera_info: distortion_model: "),
     (Role.CAMERA_INFO, lambda: camera_info(2, d=[1.0, 2.0]), "camera_info: d: 2 numbers"),
