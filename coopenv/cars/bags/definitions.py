@@ -57,13 +57,13 @@ def decode(channel: BagChannel, data: bytes) -> Any:
         CoopenvError: the bytes are no message, or may be one of more objects than `MOST_OBJECTS`, or the type has no
             usable definition.
     """
-    store, cost = _store(channel)
+    store, cost, why = _store(channel)
     if cost.objects + cost.per_byte * len(data) > MOST_OBJECTS:
         raise CoopenvError(f"{channel.kind}: {len(data)} bytes may hold over {MOST_OBJECTS} values")
     try:
         return (store.deserialize_ros1 if channel.encoding == ROS1 else store.deserialize_cdr)(data, channel.kind)
     except Exception as error:  # any error of the library at malformed bytes
-        raise CoopenvError(f"{channel.kind}: cannot be read ({type(error).__name__})") from None
+        raise CoopenvError(f"{channel.kind}: cannot be read ({type(error).__name__}){why}") from None
 
 
 def stamp(channel: BagChannel, data: bytes) -> int:
@@ -90,10 +90,10 @@ def _known(channel: BagChannel) -> Any:
 
 
 @lru_cache(maxsize=128)
-def _store(channel: BagChannel) -> tuple[Any, _Cost]:
-    """Return a store with a channel's type, by its own definition if that is of use or else ours, and its size.
+def _store(channel: BagChannel) -> tuple[Any, _Cost, str]:
+    """Return a store with a channel's type, the size of that, and why its own definition is not used, or nothing.
 
-    Raises CoopenvError: there is neither.
+    Raises CoopenvError: it is not used, and there is none of ours.
     """
     known, kind = _known(channel), channel.kind
     try:
@@ -105,12 +105,12 @@ def _store(channel: BagChannel) -> tuple[Any, _Cost]:
             store.register(found)
             if {*re.findall(r"[\w/]+/msg/\w+", str(found))} - found.keys():
                 store.register({name: known.fielddefs[name] for name in known.fielddefs.keys() - found.keys()})
-        return store, _cost(store.fielddefs, kind)
+        return store, _cost(store.fielddefs, kind), ""
     except Exception as error:  # any error of the library at a malformed definition
-        if kind in known.fielddefs:
-            return known, _cost(known.fielddefs, kind)
-        why = f": {error}" if isinstance(error, CoopenvError) else ""
-        raise CoopenvError(f"{kind}: its definition in the bag is of no use{why}") from None
+        why = f"its definition in the bag is of no use: {error if isinstance(error, CoopenvError) else 'no definition'}"
+        if kind not in known.fielddefs:
+            raise CoopenvError(f"{kind}: {why}") from None
+        return known, _cost(known.fielddefs, kind), f"; {why}" if channel.definition else ""
 
 
 def _parsed(channel: BagChannel) -> dict[str, Any]:

@@ -23,7 +23,8 @@ ENDS_EARLY = "its end is missing"
 ZSTD = b"\x28\xb5\x2f\xfd"
 """Begin of a packed message; a message of CDR begins with 0."""
 MOST_CHANNELS = 2**16  # as many as an MCAP file has numbers for
-IN_MEMORY = 512  # bytes that a message takes at least once it is decoded
+OVERHEAD, IN_MEMORY = 128, 512
+"""Bytes of a file's allowance that a message takes for the time to pass over it, and for the memory once it is read."""
 
 Entries = Iterator[tuple[BagChannel, int, bytes | None]]
 """Messages: channel, time of reception (ns), bytes; None: the channel alone."""
@@ -61,6 +62,7 @@ class Part:
         allowance = Allowance(self.path.stat().st_size)
         try:
             for entry in FORMS[self.path.suffix](self.path, allowance):
+                allowance.take(OVERHEAD)
                 if len(self.counts) > MOST_CHANNELS:
                     raise TooLargeError(f"has more than {MOST_CHANNELS} topics")
                 yield entry
