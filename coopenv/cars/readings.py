@@ -235,14 +235,18 @@ def read(
 
 def _twist(message: Any) -> Twist:
     """Return the velocities of a TwistWithCovarianceStamped or Odometry; a negative variance means not measured."""
-    with_covariance = message.twist
-    linear, angular = _velocities(with_covariance.twist)
-    variances = np.asarray(with_covariance.covariance, dtype=np.float64).reshape(6, 6).diagonal()
-    return Twist(None if variances[0] < 0.0 else linear, None if variances[5] < 0.0 else angular)
+    value = _velocities(message.twist.twist)
+    variances = np.asarray(message.twist.covariance, dtype=np.float64).reshape(6, 6).diagonal()
+    linear, angular = (None if variances[k] < 0.0 else part for k, part in ((0, value.linear), (5, value.angular)))
+    return Twist(linear, angular)
 
 
-def _velocities(twist: Any) -> tuple[Array, Array]:
-    return vector(twist.linear, "twist.linear", FASTEST), vector(twist.angular, "twist.angular", SPINNING)
+def _velocities(twist: Any) -> Twist:
+    """Return velocities, in which NaN means not measured: a turn rate is unknown, what wheels do not do is 0."""
+    linear, angular = ([part.x, part.y, part.z] for part in (twist.linear, twist.angular))
+    linear[1:], angular[:2] = ([0.0 if math.isnan(v) else v for v in some] for some in (linear[1:], angular[:2]))
+    known = None if math.isnan(angular[2]) else numbers_of(angular, "twist.angular", SPINNING)
+    return Twist(numbers_of(linear, "twist.linear", FASTEST), known)
 
 
 def _turning(message: Any) -> Twist:
@@ -287,7 +291,7 @@ POSES: dict[str, Callable[[Any], Value]] = {
 }
 TWISTS: dict[str, Callable[[Any], Value]] = {
     "geometry_msgs/msg/TwistWithCovarianceStamped": _twist,
-    "geometry_msgs/msg/TwistStamped": lambda message: Twist(*_velocities(message.twist)),
+    "geometry_msgs/msg/TwistStamped": lambda message: _velocities(message.twist),
     "nav_msgs/msg/Odometry": _twist,  # in the child frame
 }
 READERS: dict[Role, dict[str, Callable[..., Value]]] = {

@@ -193,6 +193,18 @@ def test_velocities_that_an_odometry_does_not_measure_are_none() -> None:
 REPORT = "coopenv_msgs/msg/RobustReport"
 
 
+def test_velocities_that_are_not_measured_may_be_nan() -> None:
+    nan, kind = np.nan, "geometry_msgs/msg/TwistStamped"
+    turning = read(Role.WHEEL, make(kind, twist=((2, nan, nan), (nan, nan, 0.5))))
+    assert isinstance(turning, Twist) and turning.linear is not None and turning.angular is not None
+    assert turning.linear.tolist() == [2, 0, 0] and turning.angular.tolist() == [0, 0, 0.5]
+    straight = read(Role.WHEEL, make(kind, twist=((2, 0, 0), (nan, nan, nan))))
+    assert isinstance(straight, Twist) and straight.angular is None
+    for wrong in ((nan, 0, 0), (2, np.inf, 0)):
+        with pytest.raises(CoopenvError, match=r"wheel: twist\.linear"):
+            read(Role.WHEEL, make(kind, twist=(wrong, (0, 0, 0))))
+
+
 def report(covariance: Any) -> dict[str, Any]:
     """Return the fields of a report with a covariance."""
     return {"pose": ((1, 2, 3), (0, 0, 0, 1)), "odometry": ((4, 5, 6), (0, 0, 0, 1)), "covariance": covariance}
