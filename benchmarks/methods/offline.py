@@ -18,7 +18,7 @@ from torchrl.objectives import SoftUpdate, TD3BCLoss
 from coopenv.backends.sources import open_simulation
 from coopenv.base.sections import Section
 from coopenv.policies import Policy, load_agent, restart
-from coopenv.runs.recorder import DrivenEpisode, dataset_place, drive_vehicles, write_dataset
+from coopenv.runs.recorder import DrivenEpisode, dataset_place, drive_vehicles, registered_spec, write_dataset
 
 WORLDS = 32
 """Driven at once for a dataset."""
@@ -75,7 +75,7 @@ def recorded(environment: str, agent: str, decisions: int, noise: float, folder:
         episodes += driven[: int(np.searchsorted(longest, missing)) + 1]
         seed += 1
     facts = {"algorithm_name": agent, "description": f"{environment}: {agent} with noise {noise} on its actions"}
-    write_dataset(episodes, scenario, environment, place, identity, facts)
+    write_dataset(episodes, scenario, registered_spec(environment), place, identity, facts)
     return there
 
 

@@ -3,8 +3,8 @@
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from io import StringIO
 from itertools import product
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from coopenv.api.engine import Engine
 from coopenv.api.registration import register_all
@@ -20,7 +21,15 @@ from coopenv.backends.base import Backend
 from coopenv.backends.sources import open_backend
 from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import check_new, replace_text, replacing_folder, writing
-from coopenv.base.installation import environment, environment_id, install_command, needing, version
+from coopenv.base.installation import (
+    environment,
+    environment_id,
+    install_command,
+    is_scene,
+    list_envs,
+    needing,
+    version,
+)
 from coopenv.estimation.observability import Trajectory
 from coopenv.estimation.poses import quaternion_wxyz
 from coopenv.evaluation.episodes import Views, play
@@ -223,15 +232,30 @@ def dataset_place(identity: str, root: Path | None, force: bool) -> Path:
     return place
 
 
+def registered_spec(environment: str, overrides: Mapping[str, Any] | None = None) -> EnvSpec | None:
+    """Return the specification from which Gymnasium makes one vehicle of an environment; None: it is a file's."""
+    if environment not in list_envs() and not is_scene(environment):
+        return None
+    register_all()
+    spec = gymnasium.spec(environment_id("scenario" if is_scene(environment) else environment))
+    changes = {"overrides": dict(overrides)} if overrides else {}
+    return replace(spec, kwargs={"name_or_path": environment, **changes})
+
+
 def write_dataset(
-    episodes: Sequence[DrivenEpisode], scenario: Scenario, name: str, place: Path, identity: str, facts: dict[str, str]
+    episodes: Sequence[DrivenEpisode],
+    scenario: Scenario,
+    spec: EnvSpec | None,
+    place: Path,
+    identity: str,
+    facts: dict[str, str],
 ) -> None:
     """Write episodes as a dataset, which takes the place of an older one.
 
     Args:
         episodes: in their order.
         scenario: scenario of the episodes.
-        name: of the registered environment; empty for another one.
+        spec: of the environment that the dataset's readers recover; None: they cannot.
         place: the result of `dataset_place`.
         identity: the dataset's.
         facts: Minari's entries of algorithm and description.
@@ -256,7 +280,6 @@ def write_dataset(
         import minari
         from minari.data_collector import EpisodeBuffer
 
-        register_all()
         arrays = ("observations", "actions", "rewards", "terminations", "truncations")
         buffers: list[Any] = [
             EpisodeBuffer(
@@ -270,7 +293,7 @@ def write_dataset(
         minari.create_dataset_from_buffers(
             dataset_id=identity,
             buffer=buffers,
-            env=gymnasium.spec(environment_id(name)) if name else None,
+            env=spec,
             requirements=[f"coopenv=={version()}"],
             data_format="hdf5",
             observation_space=observation_space(observation_layout(scenario)),
