@@ -15,10 +15,11 @@ from torch import nn
 from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SoftUpdate, TD3BCLoss
 
+from coopenv.api.registration import registered_spec
 from coopenv.backends.sources import open_simulation
 from coopenv.base.sections import Section
 from coopenv.policies import Policy, load_agent, restart
-from coopenv.runs.recorder import DrivenEpisode, dataset_place, drive_vehicles, registered_spec, write_dataset
+from coopenv.runs.recorder import DrivenEpisode, dataset_place, drive_vehicles, write_dataset
 
 WORLDS = 32
 """Driven at once for a dataset."""

@@ -51,6 +51,11 @@ OWNED = {
 }
 """Keys of highway-env's configuration that follow from other parts of a scenario, named here."""
 
+UNFIT = {
+    "two-way": "its rewards need discrete actions",
+    "lane-keeping": "its steps are those of one vehicle's own model",
+}
+
 NO_ENVIRONMENT = f"backend 'highway' needs highway-env, which is not installed: {install_command('highway')}"
 
 
@@ -107,6 +112,8 @@ def _creator(name: str) -> Any:
         near = suggest(name, known) or f"; known: {listed(sorted(known), 40)}"
         raise ScenarioError(f"highway.id: highway-env has no environment {shown(name)}{near}")
     creator: Any = load_env_creator(str(known[name]))
+    if why := UNFIT.get(name.rpartition("-v")[0]):
+        raise ScenarioError(f"highway.id: {name} takes no speed and steering of vehicles from here: {why}")
     if not hasattr(creator, "default_config"):
         raise ScenarioError(f"highway.id: {name} is not one environment but a wrapper of another")
     return creator

@@ -260,9 +260,10 @@ def dataset(given: DatasetOptions) -> None:
     environment, policy, log = given.environment, given.policy, options.console(stderr=True)
     changes = options.parse_overrides(given.overrides)
     name, scenario = Path(environment).stem, options.load(environment, changes)
+    from coopenv.api.registration import registered_spec
     from coopenv.policies import load_policy
     from coopenv.runs.console import Progress, compile_notice
-    from coopenv.runs.recorder import dataset_place, drive_vehicles, registered_spec, write_dataset
+    from coopenv.runs.recorder import dataset_place, drive_vehicles, write_dataset
 
     driver = load_policy(policy, scenario, given.seed)
     own = Path(policy.rpartition(":")[2] or policy).name

@@ -3,33 +3,22 @@
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from io import StringIO
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 
 from coopenv.api.engine import Engine
-from coopenv.api.registration import register_all
 from coopenv.api.terms.layout import action_space, observation_layout, observation_space
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import open_backend
 from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import check_new, replace_text, replacing_folder, writing
-from coopenv.base.installation import (
-    environment,
-    environment_id,
-    install_command,
-    is_scene,
-    list_envs,
-    needing,
-    version,
-)
+from coopenv.base.installation import environment, install_command, needing, version
 from coopenv.estimation.observability import Trajectory
 from coopenv.estimation.poses import quaternion_wxyz
 from coopenv.evaluation.episodes import Views, play
@@ -232,30 +221,15 @@ def dataset_place(identity: str, root: Path | None, force: bool) -> Path:
     return place
 
 
-def registered_spec(environment: str, overrides: Mapping[str, Any] | None = None) -> EnvSpec | None:
-    """Return the specification from which Gymnasium makes one vehicle of an environment; None: it is a file's."""
-    if environment not in list_envs() and not is_scene(environment):
-        return None
-    register_all()
-    spec = gymnasium.spec(environment_id("scenario" if is_scene(environment) else environment))
-    changes = {"overrides": dict(overrides)} if overrides else {}
-    return replace(spec, kwargs={"name_or_path": environment, **changes})
-
-
 def write_dataset(
-    episodes: Sequence[DrivenEpisode],
-    scenario: Scenario,
-    spec: EnvSpec | None,
-    place: Path,
-    identity: str,
-    facts: dict[str, str],
+    episodes: Sequence[DrivenEpisode], scenario: Scenario, spec: Any, place: Path, identity: str, facts: dict[str, str]
 ) -> None:
     """Write episodes as a dataset, which takes the place of an older one.
 
     Args:
         episodes: in their order.
         scenario: scenario of the episodes.
-        spec: of the environment that the dataset's readers recover; None: they cannot.
+        spec: Gymnasium's, of the environment that readers recover; None: of none.
         place: the result of `dataset_place`.
         identity: the dataset's.
         facts: Minari's entries of algorithm and description.

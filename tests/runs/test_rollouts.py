@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import coopenv
+from coopenv.api.registration import registered_spec
 from coopenv.base.errors import CoopenvError, DeviceError
 from coopenv.base.format import json_text
 from coopenv.cli.app import main
@@ -23,7 +24,7 @@ from coopenv.estimation.observability import Trajectory, analyse_observability
 from coopenv.policies import load_agent
 from coopenv.runs import Rollout, rollout
 from coopenv.runs.console import gaps, legend, metrics_table, rates, remarks
-from coopenv.runs.recorder import drive_vehicles, registered_spec
+from coopenv.runs.recorder import drive_vehicles
 from coopenv.runs.rollouts import Ending, outcome_line, run_metrics, theory_rates, vehicle_metrics
 from tests.helpers.commands import printed, refused
 from tests.helpers.env_suite import SHIPPED
