@@ -51,10 +51,7 @@ OWNED = {
 }
 """Keys of highway-env's configuration that follow from other parts of a scenario, named here."""
 
-UNFIT = {
-    "two-way": "its rewards need discrete actions",
-    "lane-keeping": "its steps are those of one vehicle's own model",
-}
+UNFIT = {"two-way": "its rewards need discrete actions", "lane-keeping": "its steps are of a model of its own"}
 
 NO_ENVIRONMENT = f"backend 'highway' needs highway-env, which is not installed: {install_command('highway')}"
 
@@ -159,7 +156,7 @@ def _config(scenario: Scenario, section: Highway, defaults: Mapping[str, Any]) -
     }
     return {
         "other_vehicles_type": f"{__name__}.{kind}",
-        **{key: list(value) if isinstance(value, tuple) else value for key, value in section.config.items()},
+        **section.config,
         "action": {"type": "MultiAgentAction", "action_config": drive},
         "observation": {"type": "AttributesObservation", "attributes": []},
         "simulation_frequency": rate,

@@ -283,7 +283,7 @@ def _end(process: subprocess.Popen[bytes], errors: IO[bytes]) -> None:
 
 
 def _option(value: Any) -> str:
-    given = value if isinstance(value, tuple) else (value,)
+    given = value if isinstance(value, list) else [value]
     return ",".join(str(x).lower() if isinstance(x, bool) else str(x) for x in given)
 
 

@@ -13,8 +13,7 @@ from array import array
 from typing import Any
 
 Rows = tuple["array[float]", "array[float]"]
-Place = tuple[float, float, float]
-"""x, y (m) and angle (deg)."""
+Place = tuple[float, float, float]  # x, y (m) and angle (deg)
 NAN = float("nan")
 
 
@@ -111,11 +110,9 @@ class SumoTraffic:
     def place(self, name: str, share: float) -> Place:
         """Return where a vehicle was after a share of the last step, in which SUMO moves it at one speed."""
         x, y, angle = self.now[name]
-        if share == 1.0 or name not in self.before:
-            return x, y, angle
-        x0, y0, angle0 = self.before[name]
-        turned = (angle - angle0 + 180.0) % 360.0 - 180.0
-        return x0 + share * (x - x0), y0 + share * (y - y0), angle0 + share * turned
+        x0, y0, angle0 = self.before.get(name, self.now[name])
+        rest, turned = 1.0 - share, (angle - angle0 + 180.0) % 360.0 - 180.0
+        return x - rest * (x - x0), y - rest * (y - y0), angle - rest * turned
 
     def rows(self, share: float) -> Rows:
         """Return x, y, angle, speed of the scenario's vehicles (NaN: not there), and x, y, angle, size of others."""

@@ -1,23 +1,12 @@
 """Sections of the programs that may move the vehicles in place of coopenv, see docs/backends.md."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
-from pydantic import Field, JsonValue, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic import Field, JsonValue
 
-from coopenv.base.sections import NonNegative, Number, Positive, Section, Word
+from coopenv.base.sections import NonNegative, Positive, Section, Word
 
-
-def _setting(value: Any, check: ValidatorFunctionWrapHandler) -> Any:
-    """Return a setting. Raises ValueError: of no kind, in one line instead of one for each kind."""
-    try:
-        return check(tuple(value) if isinstance(value, list) else value)
-    except ValidationError:
-        raise ValueError("expected true or false, a number, a word, a list of numbers, or a table") from None
-
-
-Kinds = bool | int | Number | Word | tuple[Number, ...] | dict[str, JsonValue] | None
-Setting = Annotated[Kinds, WrapValidator(_setting)]
 File = Annotated[str, Field(min_length=1, max_length=1_000)]
 """A path; a relative one is looked for beside the scenario's file."""
 
@@ -50,7 +39,7 @@ class Highway(Cosimulator):
 
     id: Annotated[str, Field(max_length=64, pattern=r"^[a-z0-9][A-Za-z0-9-]*-v\d+$")]
     """Id in Gymnasium's registry, such as `intersection-v0`."""
-    config: dict[str, Setting] = Field(default={})
+    config: dict[str, JsonValue] = Field(default={})
     """Configuration of the environment by key; this file's settings (rates, sizes of actions) are not repeated here."""
     dynamical: bool = False
     """Give driven vehicles tyres that slip (highway-env's BicycleVehicle); otherwise its kinematic bicycle."""
@@ -89,7 +78,7 @@ class Sumo(Cosimulator):
     """Polygons whose type begins so are obstacles, up to their parameter `height` or `building_height`."""
     building_height: Positive = 10.0
     """m"""
-    options: dict[str, Setting] = Field(default={})
+    options: dict[str, JsonValue] = Field(default={})
     """SUMO's own options by name, without options that follow from settings of this file."""
     included: bool = False
     """True if this file contains the roads, landmarks, buildings and routes of SUMO's files; written by coopenv."""
@@ -103,7 +92,7 @@ class Program(Cosimulator):
 
     code: Annotated[str, Field(min_length=1, max_length=1_000, pattern=":")]
     """Class that is made from the scenario, `file.py:Class`."""
-    options: dict[str, Setting] = Field(default={})
+    options: dict[str, JsonValue] = Field(default={})
     """Further arguments of the class, by name."""
 
 

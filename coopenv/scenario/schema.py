@@ -50,8 +50,7 @@ class _Loaded(type(Section)):  # type: ignore[misc]
 
     def __call__(cls, *values: Any, **entries: Any) -> Any:
         if values:
-            given = f"takes 0 positional arguments but {len(values)} were given"
-            raise TypeError(f"{cls.__name__}() {given}; entries by name; {READ}")
+            raise TypeError(f"{cls.__name__}() takes 0 positional arguments but {len(values)} were given; {READ}")
         return validated(cls, entries, cls.__name__, ScenarioError)
 
     def __getattr__(cls, name: str) -> Any:

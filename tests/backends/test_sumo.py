@@ -280,7 +280,7 @@ def test_its_process_ends_with_the_program_that_has_started_it() -> None:
         ({"sumo.nets": "a"}, r"sumo\.nets: unknown key \(did you mean 'net'\?\)"),
         ({"sumo.options": {"step-length": 0.05}}, r"options\.step-length: follows from rates\.camera; leave this out"),
         ({"sumo.options": {"no-such-option": 1}}, "SUMO, 0 s after the reset: .*no-such-option"),
-        ({"sumo.options": {"scale": [1, 2]}}, r"'scale': '1\.0,2\.0' is not a valid float"),
+        ({"sumo.options": {"scale": [1, 2]}}, r"'scale': '1,2' is not a valid float"),
         ({"rates.camera": 2e3, "rates.decision": 5.0}, r"rates\.camera: SUMO's shortest step is 1 ms, not 0\.5 ms"),
         ({"sumo.options": {"begin": 60.0}}, r"options\.begin: follows from sumo\.begin; leave this out"),
         ({"vehicles.6.routes": ["south_nort"]}, r"vehicles\.6\.routes: unknown route 'south_nort'; known: west_east"),
