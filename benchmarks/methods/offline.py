@@ -15,6 +15,7 @@ from torch import nn
 from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SoftUpdate, TD3BCLoss
 
+from coopenv.api.registration import registered_spec
 from coopenv.backends.sources import open_simulation
 from coopenv.base.sections import Section
 from coopenv.policies import Policy, load_agent, restart
@@ -75,7 +76,7 @@ def recorded(environment: str, agent: str, decisions: int, noise: float, folder:
         episodes += driven[: int(np.searchsorted(longest, missing)) + 1]
         seed += 1
     facts = {"algorithm_name": agent, "description": f"{environment}: {agent} with noise {noise} on its actions"}
-    write_dataset(episodes, scenario, environment, place, identity, facts)
+    write_dataset(episodes, scenario, registered_spec(environment), place, identity, facts)
     return there
 
 

@@ -120,7 +120,7 @@ class EstimateInfo(TypedDict):
 
 
 class Info(TypedDict):
-    """Entries of `infos[agent]`, always the same ones."""
+    """Entries of `infos[agent]`, always the same ones; `infos[agent].items()` are those that are numbers."""
 
     truth: dict[str, np.ndarray]
     """Fields of `Step`, and lasting errors of sensors and faults where the scenario has them."""

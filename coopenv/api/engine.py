@@ -344,7 +344,7 @@ class Saved(Explained):
 
     def __getitem__(self, key: object) -> NoReturn:
         """Refuse, also iteration and `in`, which ask for this."""
-        raise TypeError(f"{type(self).__name__} has no entries; reset() and step() return one per agent")
+        raise TypeError(f"'{type(self).__name__}' object is not subscriptable; reset() and step() return one per agent")
 
     def __repr__(self) -> str:
         return one_line(self, self.metadata["name"].removesuffix("_v0"), self._facts)

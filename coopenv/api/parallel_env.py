@@ -35,6 +35,22 @@ from coopenv.world.state import FAULTS, LASTING_ERRORS
 Observations = dict[str, Any]
 Infos = dict[str, Info]
 
+DETAILS = ("truth", "estimate", "visible", "reward_terms", "outcome", "car")
+"""Entries of an info that are no numbers, but tables and words."""
+
+
+class AgentInfo(dict[str, Any]):
+    """An `Info` with all of its entries, whose `items()` are the numbers alone: trainers make tensors of them."""
+
+    def items(self) -> Any:
+        """Return the entries that are numbers, the same ones at every step."""
+        return {name: self[name] for name in self if name not in DETAILS}.items()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy all entries."""
+        return AgentInfo, (dict(self),)
+
+
 RENDER_MODES = ("rgb_array", "human")
 
 
@@ -187,10 +203,8 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         rows = self.engine.view("observation")[0].copy()
         if self._flat:
             return {agent: rows[self._index[agent]] for agent in agents}
-        layout = self.engine.layout
-        return {
-            agent: {name: rows[self._index[agent], field.slice] for name, field in layout.items()} for agent in agents
-        }
+        parts = self.engine.layout.parts
+        return {agent: {name: rows[self._index[agent], place] for name, place in parts.items()} for agent in agents}
 
     def _infos(self, agents: list[str]) -> Infos:
         """Return one info per agent, always with the same keys."""
@@ -208,18 +222,18 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         infos: Any = {}
         for agent in agents:
             i = self._index[agent]
-            infos[agent] = {
-                "truth": {name: values[i] for name, values in truth.items()},
-                "estimate": {name: values[i] for name, values in estimate.items()},
-                "visible": tuple(seen[i]),
+            infos[agent] = AgentInfo(
+                truth={name: values[i] for name, values in truth.items()},
+                estimate={name: values[i] for name, values in estimate.items()},
+                visible=tuple(seen[i]),
                 **{name: values[i] for name, values in numbers.items()},
-                "reward_terms": dict(zip(engine.reward_terms, terms[i], strict=True)),
-                "time": time,
-                "outcome": self._outcomes[ended[i]],
-                "late_ticks": late[i],
-                "missing_ticks": missing[i],
+                reward_terms=dict(zip(engine.reward_terms, terms[i], strict=True)),
+                time=time,
+                outcome=self._outcomes[ended[i]],
+                late_ticks=late[i],
+                missing_ticks=missing[i],
                 **({"car": self._notes(i)} if self._notes else {}),
-            }
+            )
         return dict(infos)
 
     def _checked_actions(self, actions: Mapping[str, np.ndarray], alive: list[str]) -> np.ndarray:

@@ -6,15 +6,18 @@ is imported when an environment is made: `import coopenv` costs little.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import pettingzoo
 from pettingzoo import aec_registry, parallel_registry
 
-from coopenv.base.installation import environment_id, list_envs
+from coopenv.base.installation import environment_id, is_scene, list_envs
 
 if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvSpec
     from pettingzoo import AECEnv
 
     from coopenv.api.parallel_env import CooperativeLocalisationEnv
@@ -42,6 +45,16 @@ def make_aec(name_or_path: Any, **options: Any) -> AECEnv[str, Any, Any]:
     from pettingzoo.utils import parallel_to_aec
 
     return parallel_to_aec(make_parallel(name_or_path, **options))
+
+
+def registered_spec(environment: str, overrides: Mapping[str, Any] | None = None) -> EnvSpec | None:
+    """Return the specification from which Gymnasium makes a vehicle of an environment; None: of a file's, without."""
+    if environment not in list_envs() and not is_scene(environment):
+        return None
+    register_all()
+    spec = gymnasium.spec(environment_id("scenario" if is_scene(environment) else environment))
+    changes = {"overrides": dict(overrides)} if overrides else {}
+    return replace(spec, kwargs={"name_or_path": environment, **changes})
 
 
 def register_all() -> None:

@@ -181,7 +181,7 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
         rows = self._rows("observation")
         if self._flat:
             return rows
-        return {name: rows[:, field.slice] for name, field in self.engine.layout.items()}
+        return {name: rows[:, place] for name, place in self.engine.layout.parts.items()}
 
     def _restart_at_once(self, flags: list[Any], infos: dict[str, Any]) -> tuple[list[Any], dict[str, Any]]:
         """Reset what is over; return the flags of the step, and the infos after it with those of the step inside.

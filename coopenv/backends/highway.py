@@ -51,6 +51,8 @@ OWNED = {
 }
 """Keys of highway-env's configuration that follow from other parts of a scenario, named here."""
 
+UNFIT = {"two-way": "its rewards need discrete actions", "lane-keeping": "its steps are of a model of its own"}
+
 NO_ENVIRONMENT = f"backend 'highway' needs highway-env, which is not installed: {install_command('highway')}"
 
 
@@ -107,6 +109,8 @@ def _creator(name: str) -> Any:
         near = suggest(name, known) or f"; known: {listed(sorted(known), 40)}"
         raise ScenarioError(f"highway.id: highway-env has no environment {shown(name)}{near}")
     creator: Any = load_env_creator(str(known[name]))
+    if why := UNFIT.get(name.rpartition("-v")[0]):
+        raise ScenarioError(f"highway.id: {name} takes no speed and steering of vehicles from here: {why}")
     if not hasattr(creator, "default_config"):
         raise ScenarioError(f"highway.id: {name} is not one environment but a wrapper of another")
     return creator
@@ -152,7 +156,7 @@ def _config(scenario: Scenario, section: Highway, defaults: Mapping[str, Any]) -
     }
     return {
         "other_vehicles_type": f"{__name__}.{kind}",
-        **{key: list(value) if isinstance(value, tuple) else value for key, value in section.config.items()},
+        **section.config,
         "action": {"type": "MultiAgentAction", "action_config": drive},
         "observation": {"type": "AttributesObservation", "attributes": []},
         "simulation_frequency": rate,

@@ -5,6 +5,7 @@ time, and the end of one is an error and not the end of this program.
 """
 
 import json
+import math
 import signal
 import subprocess
 import sys
@@ -23,11 +24,11 @@ from coopenv.base.errors import CoopenvError, ScenarioError, check_one_of, short
 from coopenv.base.installation import install_command
 from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario
-from coopenv.scenario.cosimulators import route_edges
+from coopenv.scenario.sumo_files import departures, route_edges
 
 OWNED = {
     "additional-files": "sumo.additional",
-    "begin": "sumo.warm_up",
+    "begin": "sumo.begin",
     "configuration-file": "sumo.net, sumo.routes and sumo.additional",
     "net-file": "sumo.net",
     "remote-port": "the connection",
@@ -45,6 +46,8 @@ OPTIONS: Mapping[str, Any] = {
     "time-to-teleport": -1.0,  # vehicles in jams do not jump
 }
 """SUMO's options unless the scenario gives others."""
+
+ROUNDING = 1e-9  # of ms, and of steps
 
 INSERTION = 60.0
 """Longest wait (s) for SUMO to have room for the driven vehicles."""
@@ -74,24 +77,27 @@ class SumoProgram(TrafficProgram):
         self._names, self._origin = scenario.vehicle_names, np.array(scenario.map.origin[:2])
         bodies = [vehicle.body for vehicle in scenario.vehicles]
         self._front = np.array([body.center[0] + body.size[0] / 2 if body else 0.0 for body in bodies])
+        period = 1000.0 / scenario.rates.camera
+        if period < 1.0:
+            raise ScenarioError(f"rates.camera: SUMO's shortest step is 1 ms, not {period:.6g} ms")
+        self._step_ms = math.floor(period + ROUNDING)  # whole ms; poses at ticks between two steps are interpolated
+        self._steps_per_tick = period / self._step_ms if period - self._step_ms > ROUNDING else 1.0
         self._request = self._reset_request()
         self._begin_taken = np.array([vehicle.motion.kind == "driven" for vehicle in scenario.vehicles])
         self._taken = self._begin_taken.copy()
-        self._seed, self._moved = -1, list[Array]()
+        self._seed, self._moved = -1, list[Array]()  # the second for each step of SUMO
         self._process: subprocess.Popen[bytes] | None = None
         self._unanswered = False
         self._last = np.zeros((len(bodies), 4))
 
     def _reset_request(self) -> dict[str, Any]:
         section, scenario = self._section, self._scenario
-        period = 1000.0 / scenario.rates.camera
-        if abs(period - round(period)) > 1e-9:
-            raise ScenarioError(f"rates.camera: SUMO steps in whole milliseconds, not in {period:.6g} ms")
         for key in section.options:
             if key in OWNED:
                 raise ScenarioError(f"sumo.options.{key}: follows from {OWNED[key]}; leave this out")
         files = {"net-file": [section.net], "route-files": section.routes, "additional-files": section.additional}
-        options = {key: ",".join(paths) for key, paths in files.items() if paths} | {"step-length": period / 1000.0}
+        options = {key: ",".join(paths) for key, paths in files.items() if paths}
+        options |= {"begin": str(section.begin), "step-length": str(self._step_ms / 1000.0)}
         arguments = [f"--{key}={_option(value)}" for key, value in {**OPTIONS, **section.options, **options}.items()]
         edges = route_edges(section) if scenario.driven else {}
         vehicles: list[dict[str, Any] | None] = []
@@ -107,7 +113,7 @@ class SumoProgram(TrafficProgram):
         return {
             "do": "reset",
             "arguments": arguments,
-            "warm_up": section.warm_up,
+            "until": section.begin + section.warm_up,
             "vehicles": vehicles,
             "center": scenario.map.origin[:2],
             "wait": INSERTION,
@@ -141,8 +147,18 @@ class SumoProgram(TrafficProgram):
         self._ask({**self._request, "arguments": [*self._request["arguments"], f"--seed={self._seed}"]})
 
     def command(self, now: Moment) -> None:
-        """Let SUMO drive to the next tick, at whose end taken vehicles are where they now drive to."""
-        dt = 1.0 / self._scenario.rates.camera
+        """Let SUMO drive to the next tick or just beyond; taken vehicles are then where they drive to until then."""
+        begun, at = len(self._moved), self._ticks * self._steps_per_tick
+        end = math.ceil((self._ticks + 1) * self._steps_per_tick - ROUNDING)
+        self._step([self._rows_after(now, (k + 1 - at) * self._step_ms / 1000.0) for k in range(begun, end)])
+
+    @property
+    def _ticks(self) -> int:
+        """Ticks since the reset."""
+        return math.floor(len(self._moved) / self._steps_per_tick + ROUNDING)
+
+    def _rows_after(self, now: Moment, dt: float) -> Array:
+        """Return vehicle, x, y (m) and angle (deg) of the taken vehicles dt s later; NaN: it is gone."""
         turned = now.heading + now.yaw_rate * dt
         middle, moved = now.heading + now.yaw_rate * dt / 2, np.full((len(turned), 4), np.nan)
         xy = now.xy + self._origin + (now.speed * dt)[:, None] * _direction(middle)
@@ -151,14 +167,16 @@ class SumoProgram(TrafficProgram):
         moved[:, 3] = 90.0 - np.degrees(turned)
         gone = np.logical_not(now.present)
         moved[gone, 1:] = np.nan
-        self._step(moved[self._taken | gone])
+        return moved[self._taken | gone]
 
-    def _step(self, moved: Array) -> None:
+    def _step(self, moves: list[Array]) -> None:
+        """Let SUMO drive so many steps, to the first that is not before a tick."""
         if self._process is None:
             raise CoopenvError("SUMO is not running: reset() starts it")
-        self._moved.append(moved)
-        rows = [[int(i), *(None if np.isnan(x) else float(x) for x in row)] for i, *row in moved]
-        self._ask({"do": "step", "moved": rows})
+        self._moved += moves
+        share = min(1.0, 1.0 - (len(self._moved) - self._ticks * self._steps_per_tick))
+        rows = [[[int(i), *(None if np.isnan(x) else float(x) for x in row)] for i, *row in moved] for moved in moves]
+        self._ask({"do": "step", "moves": rows, "share": share})
 
     def poses(self) -> Poses:
         """Return all poses, see `TrafficProgram`."""
@@ -202,7 +220,8 @@ class SumoProgram(TrafficProgram):
         line = self._process.stdout.readline()
         head = json.loads(line) if line.endswith(b"\n") else self._fail()
         if "error" in head:
-            self._fail(head["error"])
+            too_few = head["error"].startswith("vehicles: ")
+            self._fail(head["error"] + (departures(self._section) if too_few else ""))
         size = 8 * (4 * head["own"] + 6 * head["others"])
         body = self._process.stdout.read(size)
         if len(body) < size:
@@ -213,7 +232,7 @@ class SumoProgram(TrafficProgram):
 
     def _fail(self, why: str = "") -> Any:
         """End the process. Raises CoopenvError: SUMO's own error, or how the process ended."""
-        process, at = self._process, len(self._moved) / self._scenario.rates.camera
+        process, at = self._process, self._ticks / self._scenario.rates.camera
         status = None if why or process is None else process.wait(PATIENCE)
         self._errors.seek(0)
         _, said, error = self._errors.read().decode(errors="replace").rpartition("Error: ")
@@ -245,8 +264,8 @@ class SumoProgram(TrafficProgram):
         if saved["seed"] >= 0:
             self.reset(saved["seed"])
             self._answer()
-            for rows in saved["moved"]:
-                self._step(rows.copy())
+            if saved["moved"]:
+                self._step([rows.copy() for rows in saved["moved"]])
                 self._last, _ = self._answer()
         self._taken = saved["taken"].copy()
 
@@ -264,7 +283,7 @@ def _end(process: subprocess.Popen[bytes], errors: IO[bytes]) -> None:
 
 
 def _option(value: Any) -> str:
-    given = value if isinstance(value, tuple) else (value,)
+    given = value if isinstance(value, list) else [value]
     return ",".join(str(x).lower() if isinstance(x, bool) else str(x) for x in given)
 
 

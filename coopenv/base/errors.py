@@ -223,26 +223,30 @@ class Explained:
             parts = [f"{part}.{name}" for part in _PARTS if public and hasattr(vars(self).get(part), name)]
             near = f" (did you mean '{parts[0]}'?)" if parts else suggest(name, public)
             known = f"{near}; known: {listed(public)}" if public else ""
-            raise AttributeError(f"{type(self).__name__} has no attribute '{name}'{known}")
+            raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'{known}")
 
 
 def explained(function: Callable[P, R], hint: str = "") -> Callable[P, R]:
-    """Return a function or method whose errors for wrong arguments list those that there are, before a hint."""
-    form = signature(function)
-    known = [name for name in form.parameters if name != "self"]
+    """Return a function or method whose errors for wrong arguments list those that there are, before a hint.
+
+    Other libraries look for Python's own words, so the error begins with them.
+    """
+    parameters = signature(function).parameters
+    known = [name for name in parameters if name != "self"]
+    by_name = [name for name, one in parameters.items() if one.kind is one.KEYWORD_ONLY]
+    keys = "; keys of a scenario are given in overrides" if "overrides" in known else ""
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        for name in [name for name in kwargs if name not in known]:
-            there = f"{suggest(name, known)}; known: {listed(known) or 'none'}"
-            keys = "; keys of a scenario are given in overrides" if "overrides" in known else ""
-            raise TypeError(f"{function.__name__}: unknown argument '{name}'{there}{keys}{hint}")
         try:
-            form.bind(*args, **kwargs)
-        except TypeError as error:  # too many, twice, or missing
-            by_name = [name for name, one in form.parameters.items() if one.kind is one.KEYWORD_ONLY]
-            there = listed(by_name or known) or "none"
-            raise TypeError(f"{function.__name__}: {error}; by name: {there}{hint}") from None
-        return function(*args, **kwargs)
+            return function(*args, **kwargs)
+        except TypeError as error:
+            if error.__traceback__ is None or error.__traceback__.tb_next is not None:
+                raise  # the call was right
+            words, unknown = str(error).partition(". Did you mean")[0], [name for name in kwargs if name not in known]
+            there = f"; by name: {listed(by_name or known) or 'none'}"  # too many, twice, or missing
+            if unknown:
+                there = f"{suggest(unknown[0], known)}; known: {listed(known) or 'none'}{keys}"
+            raise TypeError(f"{words}{there}{hint}") from None
 
     return call

@@ -60,7 +60,7 @@ class Section(BaseModel):
                 keys = [] if name.startswith("_") else [*type(self).model_fields]
                 near = suggest(name, [*keys, *(m for m in _METHODS if hasattr(type(self), m))])
                 known = f"{near}; keys: {listed(keys, 40)}; {CHANGE}, model_dump() data" if keys else ""
-                raise AttributeError(f"{type(self).__name__} has no attribute '{name}'{known}") from None
+                raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'{known}") from None
 
     @classmethod
     @cache

@@ -258,8 +258,9 @@ class DatasetOptions:
 def dataset(given: DatasetOptions) -> None:
     """Write episodes of a policy as a Minari dataset, one per vehicle."""
     environment, policy, log = given.environment, given.policy, options.console(stderr=True)
-    name, scenario = Path(environment).stem, options.load(environment, options.parse_overrides(given.overrides))
-    from coopenv.base.installation import list_envs
+    changes = options.parse_overrides(given.overrides)
+    name, scenario = Path(environment).stem, options.load(environment, changes)
+    from coopenv.api.registration import registered_spec
     from coopenv.policies import load_policy
     from coopenv.runs.console import Progress, compile_notice
     from coopenv.runs.recorder import dataset_place, drive_vehicles, write_dataset
@@ -272,9 +273,7 @@ def dataset(given: DatasetOptions) -> None:
         episodes = drive_vehicles(scenario, driver, given.seed, given.worlds, progress.update)
     again = options.command_text("dataset", given, ("identity", "out", "force"))
     facts = {"algorithm_name": own, "description": f"{scenario.title}: {again}"}
-    alone = sum(scenario.acting) == 1  # which the registered environment drives
-    registered = name if environment in list_envs() and not given.overrides and alone else ""
-    write_dataset(episodes, scenario, registered, place, identity, facts)
+    write_dataset(episodes, scenario, registered_spec(environment, changes), place, identity, facts)
     steps = sum(len(episode.actions) for episode in episodes)
     size = f"{len(episodes)} episodes, {steps:,} steps"
     options.console().print(f"{place.parent}: {size}, minari.load_dataset('{identity}')", soft_wrap=True)

@@ -6,6 +6,7 @@ import inspect
 import shlex
 from collections.abc import Callable, Iterable
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -13,7 +14,7 @@ import numpy as np
 from pydantic import Field, PositiveFloat, ValidationError
 
 from coopenv.base import installation
-from coopenv.base.errors import CoopenvError, error_text, printable, shown, suggest
+from coopenv.base.errors import CoopenvError, error_text, explained, printable, shown, suggest
 from coopenv.base.installation import data_directory, list_agents
 from coopenv.base.sections import Section, one_line, read_toml
 from coopenv.policies.base import PLAIN, Policy, decide, restart
@@ -240,6 +241,7 @@ def agents_for(environment: str) -> list[str]:
     return [name for name in list_agents() if environment in find_agent(name).environments]
 
 
+@partial(explained, hint=", for example load_agent('peek', 'facade')")
 def load_agent(name_or_place: str | Path | Callable[..., Any], scenario: ScenarioLike) -> Policy:
     """Return a driver for the vehicles of an environment or scenario, by what `find_agent` takes.
 

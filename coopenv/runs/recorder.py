@@ -10,17 +10,15 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.api.registration import register_all
 from coopenv.api.terms.layout import action_space, observation_layout, observation_space
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import open_backend
 from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import check_new, replace_text, replacing_folder, writing
-from coopenv.base.installation import environment, environment_id, install_command, needing, version
+from coopenv.base.installation import environment, install_command, needing, version
 from coopenv.estimation.observability import Trajectory
 from coopenv.estimation.poses import quaternion_wxyz
 from coopenv.evaluation.episodes import Views, play
@@ -224,14 +222,14 @@ def dataset_place(identity: str, root: Path | None, force: bool) -> Path:
 
 
 def write_dataset(
-    episodes: Sequence[DrivenEpisode], scenario: Scenario, name: str, place: Path, identity: str, facts: dict[str, str]
+    episodes: Sequence[DrivenEpisode], scenario: Scenario, spec: Any, place: Path, identity: str, facts: dict[str, str]
 ) -> None:
     """Write episodes as a dataset, which takes the place of an older one.
 
     Args:
         episodes: in their order.
         scenario: scenario of the episodes.
-        name: of the registered environment; empty for another one.
+        spec: Gymnasium's, of the environment that readers recover; None: of none.
         place: the result of `dataset_place`.
         identity: the dataset's.
         facts: Minari's entries of algorithm and description.
@@ -256,7 +254,6 @@ def write_dataset(
         import minari
         from minari.data_collector import EpisodeBuffer
 
-        register_all()
         arrays = ("observations", "actions", "rewards", "terminations", "truncations")
         buffers: list[Any] = [
             EpisodeBuffer(
@@ -270,7 +267,7 @@ def write_dataset(
         minari.create_dataset_from_buffers(
             dataset_id=identity,
             buffer=buffers,
-            env=gymnasium.spec(environment_id(name)) if name else None,
+            env=spec,
             requirements=[f"coopenv=={version()}"],
             data_format="hdf5",
             observation_space=observation_space(observation_layout(scenario)),

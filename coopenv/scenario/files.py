@@ -14,11 +14,11 @@ from coopenv.base.format import plain
 from coopenv.base.installation import is_scene, scenario_path
 from coopenv.base.sections import TOO_DEEP, Section, read_toml, validated
 from coopenv.scenario.bodies import with_groups
-from coopenv.scenario.cosimulators import with_sumo
 from coopenv.scenario.own_terms import located
 from coopenv.scenario.scenes import MOST_VEHICLES, scene_text
 from coopenv.scenario.schema import Scenario
 from coopenv.scenario.sites import STREETS_KEY, Streets, with_streets
+from coopenv.scenario.sumo_files import with_sumo
 
 DEFAULTS_KEY = "vehicle_defaults"
 """A table of the file whose entries hold for every vehicle without its own."""

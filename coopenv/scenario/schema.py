@@ -50,11 +50,11 @@ class _Loaded(type(Section)):  # type: ignore[misc]
 
     def __call__(cls, *values: Any, **entries: Any) -> Any:
         if values:
-            raise TypeError(f"{cls.__name__} takes entries by name; {READ}")
+            raise TypeError(f"{cls.__name__}() takes 0 positional arguments but {len(values)} were given; {READ}")
         return validated(cls, entries, cls.__name__, ScenarioError)
 
     def __getattr__(cls, name: str) -> Any:
-        raise AttributeError(f"class {cls.__name__} has no attribute '{name}'; {READ}")
+        raise AttributeError(f"type object '{cls.__name__}' has no attribute '{name}'; {READ}")
 
 
 class Scenario(Section, metaclass=_Loaded):

@@ -20,6 +20,7 @@ from coopenv.api.arguments import Info
 from coopenv.base.errors import Explained
 from coopenv.base.files import replace_text
 from coopenv.cli.app import main
+from coopenv.policies import load_agent
 from coopenv.runs import record, rollout
 from coopenv.scenario import Scenario
 from tests.helpers.commands import refused
@@ -128,6 +129,36 @@ def test_infos_have_the_entries_that_their_type_names() -> None:
         assert info["estimate"].keys() == get_type_hints(hints["estimate"]).keys()
 
 
+def test_items_of_an_info_are_its_numbers() -> None:
+    """Trainers make tensors of them; words and tables stay entries by name, in copies too."""
+    env = coopenv.parallel_env("crossing_path")
+    _, infos = env.reset(seed=0)
+    first = {name: np.shape(value) for name, value in infos["vehicle_1"].items()}
+    _, _, _, _, infos = env.step({agent: np.zeros(2) for agent in env.agents})
+    info = infos["vehicle_1"]
+    numbers = {name: np.asarray(value) for name, value in info.items()}
+    assert first == {name: value.shape for name, value in numbers.items()}
+    assert all(value.dtype.kind in "fi" for value in numbers.values()) and "nees" in numbers
+    for twin in (copy.deepcopy(info), pickle.loads(pickle.dumps(info)), dict(info), {**info}):
+        assert twin.keys() == info.keys() and twin["outcome"] == "under way"
+        assert np.array_equal(twin["truth"]["position"], info["truth"]["position"])
+
+
+def test_a_dict_observation_has_no_empty_boxes() -> None:
+    """A vehicle without others has no messages; the flat observation's table has their fields, without entries."""
+    env, batch = (
+        coopenv.parallel_env("crossing_path", observation="dict"),
+        coopenv.make_vec("crossing_path", num_worlds=2, observation="dict"),
+    )
+    for space in (env.observation_space("vehicle_1"), batch.single_observation_space):
+        assert min(part.shape[0] for part in space.values()) > 0
+    assert env.observation_space("vehicle_1").contains(env.reset(seed=0)[0]["vehicle_1"])
+    assert batch.observation_space.contains(batch.reset(seed=0)[0])
+    empty = {name for name, field in env.observation_layout.items() if field.start == field.stop}
+    assert env.observation_layout.keys() - env.observation_space("vehicle_1").keys() == empty
+    assert "message_mask" in empty
+
+
 def test_figures_show_in_notebooks_that_have_not_loaded_pyplot(scenario: Scenario) -> None:
     results = coopenv.run(scenario, seed=4)
     for figure in (results.figure(), results.trajectory.figure("errors")):
@@ -156,12 +187,12 @@ def test_a_scenario_is_read_by_dotted_keys_and_lists_them() -> None:
     assert "reward.weights.progress" in scenario and "reward.weights.nosuch" not in scenario
     for attempt in (lambda: scenario["noise.enabledd"], lambda: scenario.noise.enabledd):
         with pytest.raises(
-            AttributeError, match=r"^Noise has no attribute 'enabledd' \(did you mean 'enabled'\?\); keys: "
+            AttributeError, match=r"^'Noise' object has no attribute 'enabledd' \(did you mean 'enabled'\?\); keys: "
         ):
             attempt()
     with pytest.raises(AttributeError, match=r"'to_toml'; .* returns a changed scenario, model_dump\(\) data$"):
         scenario.to_toml()
-    with pytest.raises(AttributeError, match=r"^class Scenario has no attribute 'load'; coopenv\.load_scenario reads"):
+    with pytest.raises(AttributeError, match=r"^type object 'Scenario' has no attribute 'load'; coopenv\.load_sce"):
         Scenario.load("facade")
     with pytest.raises(AttributeError, match=r"'to_dict' \(did you mean 'model_dump'\?\); keys: "):
         scenario.to_dict()
@@ -170,13 +201,12 @@ def test_a_scenario_is_read_by_dotted_keys_and_lists_them() -> None:
 
 
 def test_arguments_in_the_wrong_place_are_named() -> None:
-    with pytest.raises(TypeError, match=r"^make_vec: too many positional arguments; by name: num_worlds, "):
+    with pytest.raises(TypeError, match=r"^make_vec\(\) takes 1 positional argument but 2 were given; by name: num_w"):
         coopenv.make_vec(ENV, 4)  # type: ignore[call-arg, misc]
-    with pytest.raises(TypeError, match=r"^compare: missing a required argument: 'environment'"):
+    with pytest.raises(TypeError, match=r"^compare\(\) missing 1 required positional argument: 'environment'; by nam"):
         coopenv.compare("mekf")  # type: ignore[call-arg]
-    with pytest.raises(
-        TypeError, match=r"^load_scenario: unknown argument 'horizon'; .* keys of a scenario are given in"
-    ):
+    words = r"^load_scenario\(\) got an unexpected keyword argument 'horizon'; .* keys of a scenario are given in"
+    with pytest.raises(TypeError, match=words):
         coopenv.load_scenario(ENV, horizon=3.0)  # type: ignore[call-arg]
 
 
@@ -299,16 +329,28 @@ def test_a_mistake_is_one_line(mistake: str, tmp_path: Path, monkeypatch: pytest
 WRONG_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "a keyword of Gymnasium": (
         lambda: coopenv.make_vec(ENV, num_envs=2),  # type: ignore[call-arg]
-        r"^make_vec: unknown argument 'num_envs' \(did you mean 'num_worlds'\?\); known: name_or_path, num_worlds, .*",
+        r"^make_vec\(\) got an unexpected keyword argument 'num_envs' \(did you mean 'num_worlds'\?\); known: ",
     ),
     "a key of the scenario": (
         lambda: coopenv.parallel_env(ENV, horizon=3.0),  # type: ignore[call-arg]
         r"'horizon'; known: name_or_path, .*; keys of a scenario are given in overrides$",
     ),
-    "an option of the shell": (lambda: coopenv.run(ENV, set={}), r"^run: .*'set' \(did you mean 'overrides'\?\)"),  # type: ignore[call-arg]
-    "seeds": (lambda: coopenv.run(ENV, seeds=3), r"^run: .*; several seeds or observers: coopenv\.compare$"),  # type: ignore[call-arg]
+    "an option of the shell": (lambda: coopenv.run(ENV, set={}), r"^run\(\) .*'set' \(did you mean 'overrides'\?\)"),  # type: ignore[call-arg]
+    "seeds": (lambda: coopenv.run(ENV, seeds=3), r"^run\(\) .*; several seeds or observers: coopenv\.compare$"),  # type: ignore[call-arg]
     "seeds of held-out worlds": (lambda: coopenv.evaluate(ENV, seeds=3), r"did you mean 'worlds'"),  # type: ignore[call-arg]
     "through Gymnasium": (lambda: gymnasium.make("coopenv/Facade-v0", observr="mekf"), r"did you mean 'observer'\?"),
+    "frames to skip, which TorchRL tries": (
+        lambda: gymnasium.make("coopenv/Facade-v0", frameskip=1),
+        r"^parallel_env\(\) got an unexpected keyword argument 'frameskip'; known: ",
+    ),
+    "an agent without its scenario": (
+        lambda: load_agent("peek"),  # type: ignore[call-arg]
+        r"^load_agent\(\) missing 1 required positional argument: 'scenario'; .*, for example load_agent\('peek', 'fac",
+    ),
+    "a scenario by position": (
+        lambda: Scenario({}),
+        r"^Scenario\(\) takes 0 positional arguments but 1 were given; .*load_scenario reads",
+    ),
     "render as in OpenAI Gym": (
         lambda: coopenv.parallel_env(ENV).render("human"),
         "render_mode is given where",
@@ -349,7 +391,7 @@ ABSENT: dict[str, tuple[Callable[[], Any], str]] = {
     "plot of a scenario": (lambda: coopenv.load_scenario(ENV).plot(), r"\(did you mean 'figure'\?\); keys: "),
     "plot": (
         lambda: coopenv.run(ENV, overrides={"horizon": 0.3}).plot(),  # type: ignore[attr-defined]
-        r"^Results has no attribute 'plot' \(did you mean 'figure'\?\); known: columns, .*trajectory$",
+        r"^'Results' object has no attribute 'plot' \(did you mean 'figure'\?\); known: columns, .*trajectory$",
     ),
 }
 
@@ -370,7 +412,7 @@ def test_an_error_within_a_property_stays_its_own() -> None:
 
         other = 1
 
-    with pytest.raises(AttributeError, match=r"^Broken has no attribute 'missing'; known: other, size$"):
+    with pytest.raises(AttributeError, match=r"^'Broken' object has no attribute 'missing'; known: other, size$"):
         Broken().size  # noqa: B018
     assert not hasattr(Broken(), "_hidden") and copy.deepcopy(Broken()).other == 1
 

@@ -238,6 +238,17 @@ def test_a_plain_environment_in_the_same_program_changes_nothing(monkeypatch: py
             r"config\.policy_frequency: follows from rates\.decision; leave this out",
         ),
         ({"highway.config.other_vehicles_type": "no.such.Class"}, "highway: intersection-v0 cannot be made"),
+        ({"highway.config.vehicle": {"bool": [[1]]}}, r"^highway\.config\.vehicle: unknown key; allowed: "),
+        ({"highway.config.observation": {"type": "Kinematics"}}, r"config\.observation: follows from \[observation\]"),
+        (
+            {"highway.config.centering_position": {"x": 1}},
+            r"centering_position: expected a value like \[0\.5, 0\.6\]",
+        ),
+        (
+            {"highway.id": "two-way-v0"},
+            r"highway\.id: two-way-v0 takes no speed .*: its rewards need discrete",
+        ),
+        ({"highway.id": "lane-keeping-v0"}, r"highway\.id: lane-keeping-v0 takes no speed and steering of vehicles"),
         ({"highway.speed": 5}, r"highway\.speed: unknown key; allowed: config, dynamical, id, most_vehicles"),
         ({"rates.camera": 12.5, "rates.decision": 12.5}, r"rates\.camera: highway-env steps a whole number"),
         ({"dynamics.wheelbase": 2.7}, r"dynamics\.wheelbase: highway-env has its own; allowed: max_acceleration"),

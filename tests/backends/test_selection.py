@@ -22,7 +22,7 @@ from coopenv.cars.bags.topic_map import load_map
 from coopenv.cli.app import main
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Truth, check_recording
-from coopenv.scenario import cosimulators
+from coopenv.scenario import sumo_files
 from tests.helpers import mrclam_files
 from tests.helpers.recordings import simulated
 
@@ -248,6 +248,6 @@ def test_pipes_are_refused_and_do_not_block(tmp_path: Path) -> None:
 def test_packed_networks_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "bomb.net.xml.gz"
     path.write_bytes(gzip.compress(b"<net>" + b" " * 3 * 2**20))
-    monkeypatch.setattr(cosimulators, "MOST_BYTES", 2**20)
+    monkeypatch.setattr(sumo_files, "MOST_BYTES", 2**20)
     with pytest.raises(CoopenvError, match=r"sumo\.net: .*bomb\.net\.xml\.gz.*: more than 1 MiB of XML"):
-        cosimulators._read_network(cosimulators.Sumo(net=str(path)))
+        sumo_files._read_network(sumo_files.Sumo(net=str(path)))

@@ -65,8 +65,32 @@ def test_traffic_is_where_a_simulation_of_ones_own_has_it(city: Path) -> None:
         assert min(np.hypot(*(middle - place)) for middle in middles) < 1e-9
 
 
-def test_odometry_is_that_of_the_motion(city: Path) -> None:
-    engine = engine_of(city, **EXACT, observer__name="dead_reckoning")
+@pytest.mark.parametrize("rate", [30.0, 60.0])
+def test_between_two_steps_traffic_is_on_the_way_from_one_to_the_next(city: Path, rate: float) -> None:
+    """Camera rates of which a period is no whole number of milliseconds."""
+    ticks, period = 20, 1000.0 / rate
+    engine = engine_of(city, rates__camera=rate, rates__decision=rate)
+    engine.reset([3])
+    for _ in range(ticks):
+        engine.step(ticks=1)
+    step, seed = int(period), engine.world.programs[0]._seed
+    whole, share = divmod(ticks * period / step, 1.0)
+    before, after = (
+        own_simulation(city.parent, seed, warm_up=30.0, steps=int(whole) + k, step=step / 1000.0) for k in (0, 1)
+    )
+    fronts = [b[:2] + share * (after[name][:2] - b[:2]) for name, b in before.items() if name in after]
+    origin = np.array(engine.world.scenario.map.origin[:2])
+    there = [row for row in poses_of(engine) if row[3] != 0]
+    assert len(there) > 10
+    for x, y, heading, _ in there:
+        front = np.array([x, y]) + origin + FRONT * np.array([np.cos(heading), np.sin(heading)])
+        assert min(np.hypot(*(place - front)) for place in fronts) < 1e-9
+
+
+@pytest.mark.parametrize("rates", [(10.0, 100.0, 5.0), (30.0, 300.0, 10.0)])
+def test_odometry_is_that_of_the_motion(city: Path, rates: tuple[float, float, float]) -> None:
+    named = dict(zip(("rates__camera", "rates__odometry", "rates__decision"), rates, strict=True))
+    engine = engine_of(city, **EXACT, **named, observer__name="dead_reckoning")
     engine.reset([1])
     for _ in range(40):
         engine.step()
@@ -155,6 +179,37 @@ def test_sumo_sees_driven_vehicles(tmp_path: Path) -> None:
     assert engine.view("collided")[0, 0] == 0
 
 
+def test_a_city_that_begins_in_the_morning(city: Path, tmp_path: Path) -> None:
+    """Its configuration states the begin; without it, the error does."""
+    folder = city.parent
+    late = folder.joinpath("grid.rou.xml").read_text()
+    for k in range(60, -1, -1):
+        late = late.replace(f'depart="{k}.', f'depart="{25205 + k}.')
+    (tmp_path / "late.rou.xml").write_text(late)
+    files = f'<net-file value="{folder / "grid.net.xml"}"/><route-files value="late.rou.xml"/>'
+    (tmp_path / "city.sumocfg").write_text(f'<c><i>{files}</i><t><begin value="7:00:00"/></t></c>')
+    engine = engine_of(city, sumo__net=str(tmp_path / "city.sumocfg"), sumo__routes=[str(tmp_path / "late.rou.xml")])
+    engine.reset([1])
+    assert engine.world.scenario.sumo.begin == 25200.0 and poses_of(engine)[:, 3].all()
+    with pytest.raises(
+        CoopenvError, match=r"SUMO has 0 after .*; the first of 1\d\d departs at 25,205 s, .* = 25205, or"
+    ):
+        engine_of(city, sumo__routes=[str(tmp_path / "late.rou.xml")]).reset([1])
+
+
+def test_left_hand_traffic_has_its_posts_beside_the_road(tmp_path: Path) -> None:
+    scenarios = []
+    for side in ((), ("--lefthand",)):
+        path = grid(tmp_path, 4, 2, "--default.lanenumber", "2", *side)
+        scenarios.append(coopenv.load_scenario(path))
+    for scenario in scenarios:
+        for post in scenario.landmarks:
+            edges = [np.array([road.start, road.end]) for road in scenario.roads]
+            middles = np.concatenate([np.linspace(start, end, 400) for start, end in edges])
+            assert np.hypot(*(middles - post.position[:2]).T).min() > 1.6  # half a lane
+    Engine(scenarios[1], 1).reset([1])
+
+
 def test_worlds_of_a_batch_are_those_of_their_seeds_and_run_beside_each_other() -> None:
     batch = engine_of(worlds=2)
     batch.reset([7, 8])
@@ -225,8 +280,9 @@ def test_its_process_ends_with_the_program_that_has_started_it() -> None:
         ({"sumo.nets": "a"}, r"sumo\.nets: unknown key \(did you mean 'net'\?\)"),
         ({"sumo.options": {"step-length": 0.05}}, r"options\.step-length: follows from rates\.camera; leave this out"),
         ({"sumo.options": {"no-such-option": 1}}, "SUMO, 0 s after the reset: .*no-such-option"),
-        ({"sumo.options": {"scale": [1, 2]}}, r"'scale': '1\.0,2\.0' is not a valid float"),
-        ({"rates.camera": 60.0, "rates.decision": 5.0}, r"rates\.camera: SUMO steps in whole milliseconds, not in 16"),
+        ({"sumo.options": {"scale": [1, 2]}}, r"'scale': '1,2' is not a valid float"),
+        ({"rates.camera": 2e3, "rates.decision": 5.0}, r"rates\.camera: SUMO's shortest step is 1 ms, not 0\.5 ms"),
+        ({"sumo.options": {"begin": 60.0}}, r"options\.begin: follows from sumo\.begin; leave this out"),
         ({"vehicles.6.routes": ["south_nort"]}, r"vehicles\.6\.routes: unknown route 'south_nort'; known: west_east"),
         ({"vehicles.6.routes": ["south_north", "west_east"]}, r"vehicles\.6: SUMO needs one of its routes"),
         ({"vehicles.0.motion": {"kind": "static"}}, r"motion\.kind: 'static' is not known to SUMO; known: driven"),

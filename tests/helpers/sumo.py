@@ -46,10 +46,10 @@ def tool(name: str, *arguments: str, cwd: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def grid(folder: Path, count: int, blocks: int = 3) -> Path:
+def grid(folder: Path, count: int, blocks: int = 3, *options: str) -> Path:
     """Write a grid of streets with two cars a second for 60 s, of which `count` are connected; return the scenario."""
     size = ("--grid.number", str(blocks + 1), "--grid.length", "100")
-    tool("netgenerate", "--grid", *size, "--default.speed", "12", "-o", "grid.net.xml", cwd=folder)
+    tool("netgenerate", "--grid", *size, "--default.speed", "12", *options, "-o", "grid.net.xml", cwd=folder)
     trips = ("-e", "60", "-p", "0.5", "--seed", "1", "--prefix", "car", "--min-distance", "300")
     tool("randomTrips.py", "-n", "grid.net.xml", "-r", "grid.rou.xml", *trips, cwd=folder)
     path = folder / "grid.toml"
@@ -72,12 +72,12 @@ print("ROWS" + json.dumps(rows))
 """
 
 
-def own_simulation(folder: Path, seed: int, warm_up: float, steps: int) -> dict[str, np.ndarray]:
+def own_simulation(folder: Path, seed: int, warm_up: float, steps: int, step: float = 0.1) -> dict[str, np.ndarray]:
     """Return x, y (m), angle (deg from north, clockwise) and speed (m/s) of all cars of the grid, without coopenv."""
     options = {
         "net-file": "grid.net.xml",
         "route-files": "grid.rou.xml",
-        "step-length": 0.1,
+        "step-length": step,
         "seed": seed,
         "collision.action": "none",
         "lanechange.duration": 2.0,

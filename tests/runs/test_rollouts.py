@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import coopenv
+from coopenv.api.registration import registered_spec
 from coopenv.base.errors import CoopenvError, DeviceError
 from coopenv.base.format import json_text
 from coopenv.cli.app import main
@@ -356,7 +357,21 @@ def test_a_dataset_that_is_there_is_kept_unless_forced(root: Path) -> None:
     assert minari.load_dataset("own/short-v3").total_episodes == 2
     assert main([*arguments, "4", "--force"]) == 0
     assert minari.load_dataset("own/short-v3").total_episodes == 4
-    assert minari.load_dataset("own/short-v3").spec.env_spec is None  # of an environment that nobody registered
+    env = minari.load_dataset("own/short-v3").recover_environment()
+    assert env.unwrapped.scenario.horizon == 2.0
+
+
+def test_a_dataset_of_several_vehicles_is_recovered_with_its_spaces(root: Path) -> None:
+    """Its environment drives one of them; overrides that change the spaces are part of it. A file is not registered."""
+    import minari
+
+    two = ["dataset", "lighthouse", "--worlds", "2", "--set", "horizon=2.0", "--set", "observation.planar=false"]
+    assert main([*two, "--id", "own/two-v0"]) == 0
+    dataset = minari.load_dataset("own/two-v0")
+    env = dataset.recover_environment()
+    assert sum(env.unwrapped.scenario.acting) > 1 and dataset.total_episodes > 2
+    assert env.observation_space == dataset.spec.observation_space and env.action_space == dataset.spec.action_space
+    assert registered_spec("own.toml") is None and registered_spec("ring:2").kwargs["name_or_path"] == "ring:2"
 
 
 def test_a_full_disk_is_found_before_anything_is_written(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,6 +78,11 @@ class Layout(dict[str, Field]):
         """Length of the flat observation."""
         return max(field.stop for field in self.values())
 
+    @property
+    def parts(self) -> dict[str, slice]:
+        """Places of the entries of an observation as a dict, which leaves out fields without a value."""
+        return {name: field.slice for name, field in self.items() if field.start < field.stop}
+
     def copy(self) -> Layout:
         """Return another one that may be changed."""
         return Layout(self, self.actions)
@@ -196,8 +201,8 @@ def settings_of_meaning(scenario: Scenario, fields: Iterable[str]) -> dict[str, 
     return values
 
 
-def observation_space(layout: Mapping[str, Field], kind: str = "flat") -> spaces.Space[Any]:
-    """Return the flat float32 Box, or a one-level Dict of one-dimensional boxes, one per field.
+def observation_space(layout: Layout, kind: str = "flat") -> spaces.Space[Any]:
+    """Return the flat float32 Box, or a one-level Dict of one-dimensional boxes, one per field with values.
 
     Raises:
         CoopenvError: `kind` is neither "flat" nor "dict".
@@ -208,8 +213,9 @@ def observation_space(layout: Mapping[str, Field], kind: str = "flat") -> spaces
     if kind == "flat":
         low = np.concatenate([np.full(f.stop - f.start, f.low, dtype=np.float32) for f in layout.values()])
         return spaces.Box(low, np.ones_like(low), dtype=np.float32)
+    fields = {name: layout[name] for name in layout.parts}
     return spaces.Dict(
-        {name: spaces.Box(f.low, 1.0, shape=(f.stop - f.start,), dtype=np.float32) for name, f in layout.items()}
+        {name: spaces.Box(f.low, 1.0, shape=(f.stop - f.start,), dtype=np.float32) for name, f in fields.items()}
     )
 
 

@@ -197,8 +197,9 @@ def test_copies_go_on_alike_and_apart(duplicate: Any) -> None:
             assert info.get("episode", {}).get("r") == twin.get("episode", {}).get("r")
 
 
-def test_dict_observations_drive_a_policy_with_several_inputs() -> None:
-    env = make_sb3_vec_env(FOUR_WAY, num_worlds=2, observation="dict", overrides={"horizon": 1.0})
+@pytest.mark.parametrize("name", [FOUR_WAY, "crossing_path"])  # the second: one vehicle, which receives nothing
+def test_dict_observations_drive_a_policy_with_several_inputs(name: str) -> None:
+    env = make_sb3_vec_env(name, num_worlds=2, observation="dict", overrides={"horizon": 1.0})
     model = PPO("MultiInputPolicy", env, n_steps=16, batch_size=64, n_epochs=1, device="cpu")
     model.learn(256)
     assert model.num_timesteps >= 256

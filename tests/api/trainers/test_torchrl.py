@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from tensordict.nn.distributions import NormalParamExtractor
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, GymEnv, PettingZooWrapper, SerialEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 from torchrl.objectives import ClipPPOLoss
@@ -41,6 +41,32 @@ def test_specs(name: str) -> None:
     env = batched_env(name, num_worlds=3, seed=0)
     assert env.batch_size == torch.Size([3])
     check_env_specs(env)
+
+
+@pytest.mark.parametrize("options", [{}, {"frame_skip": 2}, {"observation": "dict"}], ids=str)
+def test_its_environment_of_gymnasium(options: dict[str, Any]) -> None:
+    """It tries `frameskip` first, and looks for Python's words in the refusal."""
+    env = GymEnv("coopenv/OpenSquare-v0", **options)
+    check_env_specs(env)
+    assert env.rollout(3).batch_size == torch.Size([3])
+
+
+def test_its_environment_of_gymnasium_in_series_and_with_pictures() -> None:
+    env = SerialEnv(2, lambda: GymEnv("coopenv/OpenSquare-v0"))
+    assert env.rollout(3).batch_size == torch.Size([2, 3])
+    pictured = GymEnv("coopenv/OpenSquare-v0", from_pixels=True, pixels_only=False)
+    assert pictured.rollout(1)["pixels"].shape[-1] == 3
+
+
+@pytest.mark.parametrize("options", [{}, {"use_mask": True, "done_on_any": False, "return_state": True}], ids=str)
+@pytest.mark.parametrize("name", ["open_square", FOUR_WAY])
+def test_its_wrapper_of_pettingzoo(name: str, options: dict[str, Any]) -> None:
+    world = coopenv.parallel_env(name, overrides={"horizon": 1.0})
+    env = PettingZooWrapper(world, **options)
+    check_env_specs(env)
+    rollout = env.rollout(25, break_when_any_done=False)
+    assert rollout["next", "done"].sum() == 2
+    assert rollout["next", "vehicle", "info", "position_error"].shape == (25, len(world.possible_agents))
 
 
 def turning(worlds: int, vehicles: int) -> np.ndarray:
