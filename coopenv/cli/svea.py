@@ -37,7 +37,8 @@ def demo(
         Path | None, typer.Option(help="Or a deployment file of your own, whose cars are fakes (fakes = true).")
     ] = None,
     port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Port of the router on this computer (default: a free one).")
+        int | None,
+        typer.Option(min=1, max=65535, help="With --real-time: port of the router (default: a free one)."),
     ] = None,
     out: Annotated[
         Path | None,
@@ -51,13 +52,19 @@ def demo(
     beside: Annotated[
         bool, typer.Option("--beside", help="Simulate the same seeds, too, and print both side by side.")
     ] = False,
+    real_time: Annotated[
+        bool,
+        typer.Option(
+            "--real-time", help="Run a router and a process per car, in real time on this computer."
+        ),
+    ] = False,
     overrides: options.Overrides = None,
 ) -> None:
-    """Let fake cars drive an experiment in real time: table, figures, and a drive that can be run again.
+    """Let fake cars drive an experiment: table, figures, and a drive that can be run again.
 
-    A router and a process per car run on this computer's loopback for as long as it takes, half a minute. The first
-    time kernels are compiled, which takes a minute or two more. The exit status is 3 where the watchdog stopped the
-    cars.
+    Cars, gates and station run in lockstep on a simulated clock, so that a busy computer takes longer and stops no car.
+    The first time kernels are compiled, which takes a minute or two. The exit status is 3 where the watchdog stopped
+    the cars.
     """
     from coopenv.runs.demo import Demo
 
@@ -65,7 +72,7 @@ def demo(
         raise CoopenvError(f"--environment: {fleet} names one; give --environment or --fleet")
     name = (environment or "svea_overtaking") if fleet is None else fleet.stem
     folder = out or Path("out") / name
-    chosen = Demo(name, folder, policy, seed, options.parse_overrides(overrides), seconds, beside, fleet)
+    chosen = Demo(name, folder, policy, seed, options.parse_overrides(overrides), seconds, beside, fleet, real_time)
     if not chosen.run(port, options.console(stderr=True), options.console()):
         raise typer.Exit(STOPPED)
 
@@ -143,7 +150,8 @@ def gate(
     Limits beyond those of the make are refused: for SVEA 1.53 m/s, 0.5236 rad, 2 m/s^2 and 4 rad/s.
     """
     from coopenv.base import interrupts
-    from coopenv.cars.gate_process import CLOCK, gate_deployment, prepare_gate, run
+    from coopenv.cars.clock import CLOCK
+    from coopenv.cars.gate_process import gate_deployment, prepare_gate, run
     from coopenv.cars.zenoh import open_transport
 
     bounds = {"speed": max_speed, "steering": max_steering, "acceleration": max_acceleration}

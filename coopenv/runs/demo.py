@@ -1,6 +1,6 @@
-"""`coopenv svea demo`: an experiment of the laboratory with fake cars, from the first process to the figures."""
+"""`coopenv svea demo`: an experiment of the laboratory with fake cars, from their start to the figures."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
@@ -20,6 +20,7 @@ from coopenv.base.installation import data_directory
 from coopenv.base.interrupts import also_kept
 from coopenv.cars.backend.backend import Svea, open_svea
 from coopenv.cars.fake.fleet import fakes
+from coopenv.cars.fake.lockstep import LockstepFakes
 from coopenv.cars.profile import Role
 from coopenv.cars.zenoh import library
 from coopenv.estimation.metrics import live_ticks, summarise
@@ -65,16 +66,20 @@ def links_report(backend: Svea, out: Console) -> None:
     for notes, here, there in _links(backend):
         table.add_row(notes["name"], notes["gate"], f"{1e3 * notes['clock_offset']:.1f} ms", str(here), str(there))
     out.print(table)
-    late = 1e3 * backend.pacer.late(0.99)
+    late = _late(backend, backend.pacer.late(0.99))
     out.print(
-        f"{health.received} messages, {health.ticks} ticks, {backend.pacer.missed} missed deadlines, "
-        f"wake-up lateness p99 {late:.2f} ms",
+        f"{health.received} messages, {health.ticks} ticks, {backend.pacer.missed} missed deadlines{late}",
         soft_wrap=True,
     )
     if left_out := [f"{name} {count}" for name, count in backend.refused.items() if count]:
         out.print(f"Left out: {', '.join(left_out)}", soft_wrap=True)
     if backend.watchdog.trip is not None:
         out.print(f"Stopped: {backend.watchdog.trip.reason}", soft_wrap=True)
+
+
+def _late(backend: Svea, seconds: float) -> str:
+    """Return how late a computer woke up, as the end of a line; empty by a simulated clock."""
+    return "" if backend.capabilities.simulated_clock else f", wake-up lateness p99 {1e3 * seconds:.2f} ms"
 
 
 def check_alive(backend: Svea) -> None:
@@ -158,6 +163,8 @@ class Demo:
     """Simulate the same seeds, too, and show them beside."""
     deployment: Path | None = None
     """One's own deployment file, whose cars are fakes; `environment` is its environment then."""
+    real_time: bool = False
+    """Let router and cars be processes in real time; else all is in this one, by a simulated clock."""
     time: float = field(default=0.0, init=False)
     """Driven time, s."""
     decisions: int = field(default=0, init=False)
@@ -179,7 +186,7 @@ class Demo:
         Of a drive that is interrupted what has been driven takes its place, unless an earlier drive stands there.
 
         Args:
-            port: of the router (None: a free one).
+            port: of the router in real time (None: a free one).
             log: progress.
             out: results.
 
@@ -187,6 +194,8 @@ class Demo:
             CoopenvError: the extra is missing, a process does not start, the cars cannot be armed, results cannot be
                 written, or no true poses are known; the drive is kept in the last case.
         """
+        if port is not None and not self.real_time:
+            raise CoopenvError("--port: cars on a simulated clock have no router; give --real-time, too")
         library()
         fleet, drive = self.fleet, self.out.with_name(f"{self.out.name}.mcap")
         driven: list[Rows] = []
@@ -194,11 +203,10 @@ class Demo:
         with writing(drive.parent):
             drive.parent.mkdir(parents=True, exist_ok=True)
         with ExitStack() as stack:
-            with compile_notice(log), Progress(log, "starting a router and fake cars"):
-                router = stack.enter_context(fakes(fleet, port, self.seed))
+            opened = self._start(fleet, port, stack, log)
             record = stack.enter_context(replacing_file(drive))
             environment = None if self.deployment else self.environment
-            backend = open_svea(fleet, environment, self.overrides, record=record, connect=router)
+            backend = opened(environment, overrides=self.overrides, record=record)
             stack.callback(backend.close)
             try:
                 if not self._drive(backend, driven, log, out) and backend.capabilities.truth:
@@ -218,18 +226,23 @@ class Demo:
             out.print(side_by_side(backend.scenario.vehicle_names, backends))
             out.print(f"RMSE: after {STEADY_FROM:g} s, up to the vehicle's end. SE: standard error over the seeds.")
             out.print("Hidden: frames in which a static landmark is not seen.")
-        late = 1e3 * float(np.quantile(self.delays, 0.99)) if self.delays else 0.0
-        out.print(
-            f"{self.time:.1f} s driven, {self.missed} of {self.decisions} deadlines missed, "
-            f"wake-up lateness p99 {late:.2f} ms over {len(self.delays)} ticks",
-            soft_wrap=True,
-        )
+        late = _late(backend, float(np.quantile(self.delays, 0.99)) if self.delays else 0.0)
+        late += f" over {len(self.delays)} ticks" if late else ""
+        out.print(f"{self.time:.1f} s driven, {self.missed} of {self.decisions} deadlines missed{late}", soft_wrap=True)
         out.print(
             f"The drive, bit for bit: coopenv run {quote(str(drive))} --steady-from {STEADY_FROM:g}", soft_wrap=True
         )
         if no_truth is not None:
             raise no_truth
         return backend.watchdog.trip is None
+
+    def _start(self, fleet: Path, port: int | None, stack: ExitStack, log: Console) -> Callable[..., Svea]:
+        """Start the cars, until the stack is left; return what opens their station."""
+        what = "a router and fake cars" if self.real_time else "fake cars"
+        with compile_notice(log), Progress(log, f"starting {what}"):
+            if not self.real_time:
+                return LockstepFakes(fleet, self.seed).station
+            return partial(open_svea, fleet, connect=stack.enter_context(fakes(fleet, port, self.seed)))
 
     def _drive(self, backend: Svea, driven: list[Rows], log: Console, out: Console) -> bool:
         """Drive seed after seed, and append the figures of each; the first one is reported as a run.

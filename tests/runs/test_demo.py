@@ -37,7 +37,7 @@ from coopenv.runs.rollouts import Rollout
 from coopenv.viz.trajectories import trajectory_figure_2d
 from tests.helpers.cars import OVERTAKING, cars, fakes, write_fleet
 from tests.helpers.commands import refused
-from tests.helpers.hub import Hub
+from coopenv.cars.fake.lockstep import Hub
 from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, mentioning, start, wait_until
 from tests.helpers.wire import free_endpoint
 

@@ -2,7 +2,6 @@
 
 import gc
 import threading
-import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -25,6 +24,7 @@ from coopenv.cars.backend.buffers import ROLES, StatusBoard
 from coopenv.cars.backend.drive import PRESENCE, DriveRecorder, RecordedTransport, head_of
 from coopenv.cars.backend.station import UNTRIED, Gates, Pacer, Station
 from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog, bearing_nis, since
+from coopenv.cars.clock import CLOCK, Clock
 from coopenv.cars.codec import encode, make, warm_up
 from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.keys import Signer, Verifier, load_keys
@@ -44,6 +44,7 @@ FIRST_MESSAGES_TIME = 3.0  # s to wait for first messages at the first reset
 CAMERA_INFO_TIME = 1.5  # s to wait for the calibration of a camera; some publish none
 READY_TIME = 2.0  # s to wait until all conditions of arming hold at once; cars publish theirs once a second
 SETTLE = 0.5  # s for fakes to settle at their start
+POLL = 0.02  # s
 
 
 class Svea:
@@ -61,6 +62,7 @@ class Svea:
         signer: Signer | None = None,
         verifier: Verifier | None = None,
         recorder: DriveRecorder | None = None,
+        clock: Clock = CLOCK,
     ) -> None:
         """Listen to the cars.
 
@@ -71,13 +73,15 @@ class Svea:
             signer: signs sent messages (None: they are not signed).
             verifier: knows the cars' keys (None: signatures do not count).
             recorder: records the messages of the ticks, and the reasons of stops.
+            clock: by which ticks are due and messages have ages; that of the cars, if it is simulated.
         """
         self.deployment, self.binding, self.scenario = deployment, binding, binding.scenario
-        self._transport, self.recorder = transport, recorder
+        self._transport, self.recorder, self._clock = transport, recorder, clock
         self.capabilities = Capabilities(
             truth=deployment.sensors.truth,
             driven=True,
             real_time=True,
+            simulated_clock=clock.simulated,
             ticks=None,
             batched=False,
             estimated=None if not binding.remote else binding.local,
@@ -85,7 +89,7 @@ class Svea:
         self.health = Health()
         self.refused: dict[str, int] = {}
         """Samples that were not used, by reason."""
-        self.pacer = Pacer(1.0 / self.scenario.rates.camera, self.scenario.ticks_per_decision)
+        self.pacer = Pacer(1.0 / self.scenario.rates.camera, self.scenario.ticks_per_decision, clock)
         self._origin = np.array(self.scenario.map.origin)
         landmarks = self.scenario.landmarks
         self._landmarks = np.array([mark.position for mark in landmarks]).reshape(-1, 3) - self._origin
@@ -100,9 +104,9 @@ class Svea:
         self.intake, self._assembler = Intake(binding, deployment.sensors), Assembler(binding)
         identity, zenoh = deployment.security.identity, deployment.network.kind == "zenoh"
         signers = {profile.topic_of(name, role): (name, identity) for name in fleet for role in BROADCAST}
-        self.station = Station(transport, self.intake.topics, verifier, signers)
-        self.gates = Gates(transport, cars, deployment.limits, signer, verifier, profile, zenoh)
-        self.board = StatusBoard(transport, cars, deployment.remote, deployment.conditions, profile)
+        self.station = Station(transport, self.intake.topics, verifier, signers, clock)
+        self.gates = Gates(transport, cars, deployment.limits, signer, verifier, profile, zenoh, clock)
+        self.board = StatusBoard(transport, cars, deployment.remote, deployment.conditions, profile, clock)
         self.monitor = LinkMonitor(deployment.safety.judge)
         self.watchdog = Watchdog(
             *(deployment.safety, self.station, self.gates, self.monitor, cars, others, self._odometry),
@@ -131,7 +135,7 @@ class Svea:
         if self.deployment.fakes:
             signed = ((seed or 0) + 2**63) % 2**64 - 2**63  # the same 64 bits
             self._transport.publish(RESET_TOPIC, encode(make("std_msgs/msg/Int64", data=signed)), reliable=True)
-            time.sleep(SETTLE)  # they go to the start of the seed
+            self._clock.sleep(SETTLE)  # they go to the start of the seed
         self.monitor.begin(self.pacer.now())
         self._listen(arm)
         self.station.dropped.clear()
@@ -148,11 +152,17 @@ class Svea:
         """Wait a limited time for messages of the cars: only driving needs them."""
         topics = [self.binding.profile.topic_of(name, role) for name in self._local for role in self._odometry]
         patience = 0.0 if self._received_once else FIRST_MESSAGES_TIME
-        _wait(lambda: all(self.station.silence(topic) < 1.0 for topic in topics), patience)
+        self._wait(lambda: all(self.station.silence(topic) < 1.0 for topic in topics), patience)
         if arm:
-            _wait(lambda: self.board.calibrations.keys() >= self._local.keys(), CAMERA_INFO_TIME)
+            self._wait(lambda: self.board.calibrations.keys() >= self._local.keys(), CAMERA_INFO_TIME)
         self._received_once = True
         self.drain()
+
+    def _wait(self, ready: Callable[[], bool], patience: float) -> None:
+        """Wait for something to become true, s at most."""
+        until = self._clock.seconds() + patience
+        while self._clock.seconds() < until and not ready():
+            self._clock.sleep(POLL)
 
     def _arm(self, release: bool) -> None:
         """Open the gates, with `release` also of cars that another station has stopped, and watch the cars.
@@ -160,7 +170,7 @@ class Svea:
         Raises:
             CoopenvError: a condition of arming does not hold.
         """
-        _wait(lambda: self._obstacle() is None, READY_TIME)
+        self._wait(lambda: self._obstacle() is None, READY_TIME)
         if found := self._obstacle():
             raise CoopenvError(f"not armed: {found}")
         if (kind := self.deployment.network.kind) != "zenoh":
@@ -303,13 +313,6 @@ class Svea:
             gc.unfreeze()
 
 
-def _wait(ready: Callable[[], bool], patience: float) -> None:
-    """Wait for something to become true, s at most."""
-    until = time.monotonic() + patience
-    while time.monotonic() < until and not ready():
-        time.sleep(0.02)
-
-
 def open_svea(
     path: str | Path,
     environment: str | None = None,
@@ -319,6 +322,7 @@ def open_svea(
     transport: Transport | None = None,
     connect: str | None = None,
     watch: bool = False,
+    clock: Clock = CLOCK,
 ) -> Svea:
     """Return the cars of a deployment file as a backend.
 
@@ -331,6 +335,7 @@ def open_svea(
         transport: a network that is open already (None: that of the file).
         connect: endpoint in place of the file's.
         watch: only receive: nothing is sent, fakes are not moved, and no car can be armed.
+        clock: see `Svea`.
 
     A `DataWarning` names landmarks and vehicles that cameras cannot identify.
 
@@ -355,8 +360,8 @@ def open_svea(
     if recorder is not None:
         roles, names = (Role.GATE, Role.STOP, *ROLES), [binding.names[i] for i in binding.local]
         aside = [binding.profile.topic_of(name, role) for name in names for role in roles]
-        link = RecordedTransport(link, recorder, aside)
-    return Svea(deployment, binding, link, signer, verifier, recorder)
+        link = RecordedTransport(link, recorder, aside, clock)
+    return Svea(deployment, binding, link, signer, verifier, recorder, clock)
 
 
 def scenario_of(deployment: Deployment, environment: str | None, overrides: Mapping[str, Any]) -> Scenario:

@@ -5,7 +5,6 @@ is not armed, or is stopped.
 """
 
 import threading
-import time
 from bisect import bisect_right
 from collections import Counter, deque
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, shown
+from coopenv.cars.clock import CLOCK, Clock
 from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Remote
 from coopenv.cars.profile import SVEA, CarProfile, Role
@@ -186,14 +186,20 @@ class Condition(NamedTuple):
 
     status: CarStatus = CarStatus()
     stamp: int = -1  # ns, clock of the car
-    since: float = float("-inf")  # s, monotonic: when the condition held
+    since: float = float("-inf")  # s, steady: when the condition held
 
 
 class StatusBoard:
     """Last condition of each car, and the reasons to stop it since arming."""
 
     def __init__(
-        self, transport: Transport, cars: tuple[str, ...], remote: Remote, needed: bool, profile: CarProfile = SVEA
+        self,
+        transport: Transport,
+        cars: tuple[str, ...],
+        remote: Remote,
+        needed: bool,
+        profile: CarProfile = SVEA,
+        clock: Clock = CLOCK,
     ) -> None:
         """Subscribe to the conditions of the cars.
 
@@ -203,8 +209,9 @@ class StatusBoard:
             remote: channels of their remote controls.
             needed: True if cars must send the conditions of their profile.
             profile: make of the cars.
+            clock: of the ages.
         """
-        self._lock = threading.Lock()
+        self._lock, self._clock = threading.Lock(), clock
         self._remote, self._needed, self._profile = remote, needed, profile
         self._conditions_needed = tuple(map(Role, profile.conditions)) if needed else ()
         self._topics = {profile.topic_of(car, role): (car, role) for car in cars for role in ROLES}
@@ -270,7 +277,7 @@ class StatusBoard:
                 return
             new = stamp > self._conditions[key].stamp and abs(delay) <= (topic.max_age or 0.0)
             if isinstance(value, CarStatus) and new:
-                self._conditions[key] = Condition(value, stamp, time.monotonic() - max(delay, 0.0))
+                self._conditions[key] = Condition(value, stamp, self._clock.seconds() - max(delay, 0.0))
                 if key in self._begun and (why := self._changed(role, self._begun[key].status, value)):
                     self._happened.setdefault(car, why)
 
@@ -294,7 +301,7 @@ class StatusBoard:
         return ""
 
     def _silent(self, car: str, role: Role) -> str:
-        age = time.monotonic() - self._conditions[car, role].since
+        age = self._clock.seconds() - self._conditions[car, role].since
         if age <= (self._profile.topics[role].max_age or 0.0):
             return ""
         words = "was received" if age == float("inf") else f"for {age:.2f} s"

@@ -14,12 +14,13 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
 from coopenv.cars.backend.binding import Binding
+from coopenv.cars.clock import CLOCK
 from coopenv.cars.codec import decode, pose, stamp_of, warm_up
 from coopenv.cars.fake.sensors import LEADER_RATE, TRUTH_RATE, Act, CarSensors, FakeCamera, SensorPublisher
 from coopenv.cars.fake.settings import USUAL, CarFaults, FakeSettings, Wire, end_process, fake_fault, fault_topic
 from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
 from coopenv.cars.gate import PERIOD, GateClock, Malformed, read_drive, write_drive
-from coopenv.cars.gate_process import CLOCK, GateConnection
+from coopenv.cars.gate_process import GateConnection
 from coopenv.cars.profile import RESET_TOPIC, MotionCommand, Role, presence_of
 from coopenv.cars.readings import READERS, CarPose, Sample, read
 from coopenv.cars.transport import Callback, Transport
@@ -46,7 +47,7 @@ class Fake:
         clock: GateClock = CLOCK,
         settings: FakeSettings = USUAL,
     ) -> None:
-        """Put the car at the start of a seed and announce it.
+        """Put the car at the start of a seed. Its gate announces it; a moving landmark announces itself.
 
         Args:
             binding: vehicles and markers of the fleet's cars.
@@ -89,11 +90,11 @@ class Fake:
         transport.subscribe(fault_topic(name), self._later(self._fault))
         if self._drives and gate is not None:
             car_clock = GateClock(lambda: clock.wall() + self._faults.clock_error(clock.steady()), clock.steady)
-            self._link = gate(self._wire, car_clock)  # which lets others see the car
+            self._link = gate(self._wire, car_clock)
             acts.append((1e9 / PERIOD, self._tick_gate))
+        elif self._drives:  # no presence: the gate's would not go with the gate
+            transport.subscribe(self._profile.topic_of(name, Role.MANUAL), self._later(self.obey))  # on the car
         else:
-            if self._drives:
-                transport.subscribe(self._profile.topic_of(name, Role.MANUAL), self._later(self.obey))  # on the car
             transport.announce(presence_of(name))
         self._now = start = clock.steady()
         self._events, self._phases = sched.scheduler(lambda: self._now, lambda _: None), self._rng

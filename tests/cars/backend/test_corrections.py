@@ -18,7 +18,7 @@ from coopenv.cars.readings import Detections, Twist
 from coopenv.cars.vision import Calibration
 from tests.helpers.cars import LAB, LAB_CARS
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage
-from tests.helpers.hub import Hub
+from coopenv.cars.fake.lockstep import Hub
 
 pytest.importorskip("rosbags", reason="needs the extra 'svea'")
 

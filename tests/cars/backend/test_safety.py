@@ -27,7 +27,7 @@ from coopenv.cars.transport import Arrival
 from coopenv.cars.vision import Calibration
 from coopenv.estimation.poses import exp_so3
 from tests.cars.backend.test_assembler import binding
-from tests.helpers.hub import Hub
+from coopenv.cars.fake.lockstep import Hub
 from tests.helpers.processes import wait_until
 
 WHEEL = SVEA.topic_of("a", Role.WHEEL)

@@ -26,7 +26,7 @@ from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.readings import Twist
 from coopenv.cars.transport import Arrival
 from coopenv.scenario import load_scenario
-from tests.helpers.hub import Hub
+from coopenv.cars.fake.lockstep import Hub
 
 PERIOD, TICKS = 0.01, 3
 MS = 1_000_000

@@ -34,7 +34,7 @@ from coopenv.runs.command import execute, report
 from coopenv.runs.demo import links_report
 from coopenv.runs.rollouts import Rollout
 from tests.helpers.cars import cars, fakes, write_fleet
-from tests.helpers.hub import Hub
+from coopenv.cars.fake.lockstep import Hub
 from tests.helpers.processes import DEADLOCK, start
 
 WHEEL, FRAMES = SVEA.topic_of("svea7", Role.WHEEL), SVEA.topic_of("svea7", Role.DETECTIONS)

@@ -34,7 +34,7 @@ from coopenv.cars.zenoh import open_zenoh
 from coopenv.cli.app import app
 from coopenv.cli.svea import next_message
 from tests.helpers.cars import OVERTAKING, fakes, open_fake, write_fleet
-from tests.helpers.hub import Hub
+from coopenv.cars.fake.lockstep import Hub
 from tests.helpers.processes import ROOT, mentioning, start, wait_until
 from tests.helpers.wire import free_endpoint, seen_by
 

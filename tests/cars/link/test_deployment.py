@@ -21,7 +21,7 @@ from coopenv.cars.profile import FOLDER, SVEA, USUAL, CarProfile, MotionCommand,
 from coopenv.cars.readings import check_types
 from coopenv.cars.transport import Arrival
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage
-from tests.helpers.hub import Hub
+from coopenv.cars.fake.lockstep import Hub
 
 GOOD = """
 environment = "crossing_path"

@@ -35,7 +35,7 @@ from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR, LIMITS, OTHER, STATION, Bench, messages_of_strangers
 from tests.cars.link.gate.messages import arm, framed_command, stop
 from tests.cars.link.gate.station import Station
-from tests.helpers.hub import Hub
+from coopenv.cars.fake.lockstep import Hub
 
 
 class Broken(Gate):

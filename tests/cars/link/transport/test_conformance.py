@@ -22,7 +22,7 @@ from coopenv.cars.ros1 import Authors, open_ros1, routes_of
 from coopenv.cars.transport import Arrival, Transport, matcher
 from coopenv.cars.zenoh import open_zenoh
 from tests.helpers.brokers import nats_server, ros_master
-from tests.helpers.hub import Hub, HubTransport
+from coopenv.cars.fake.lockstep import Hub, HubTransport
 from tests.helpers.processes import wait_until
 from tests.helpers.wire import free_endpoint, free_port, heard_by, seen_by
 
