@@ -118,4 +118,5 @@ class _Repeated:
         return self in self._among
 
     def end(self) -> None:
-        self._among.remove(self)
+        if self in self._among:
+            self._among.remove(self)

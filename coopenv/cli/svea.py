@@ -181,8 +181,11 @@ def health(
         float | None,
         typer.Option(min=0.0, help="s of messages for offset and drift of its clocks (default: 5 with --off-board)."),
     ] = None,
+    read_only: Annotated[
+        bool, typer.Option("--read-only", help="Send nothing: a health check of a container.")
+    ] = False,
 ) -> None:
-    """Print the next status of a car's gate, and try from outside a neutral command to the wheels.
+    """Print the next status of a car's gate, and unless --read-only try from outside a neutral command to the wheels.
 
     The exit status is 2 where no status comes, or where the command gets through: the gate notices it and stops the
     car. On the car it connects to where the gate does, and tries from the deployment's network.connect. From elsewhere:
@@ -220,6 +223,8 @@ def health(
 
             for name, clock in measured_clocks(transport, fleet, car, seconds).items():
                 print(f"{car}: clock of {name}: {clock}")
+        if read_only:
+            return
         if fleet.network.kind != "zenoh":
             print(f"{car}: network.kind = {fleet.network.kind} {UNTRIED}")
             return

@@ -13,8 +13,8 @@ from coopenv.cars.codec import encode, make
 from coopenv.cars.deployment import load_deployment
 from coopenv.cars.fake.car import Fake, fault_topic
 from coopenv.cars.fake.fleet import prepare_fake, run
-from coopenv.cars.transport import Transport
 from coopenv.cars.fake.lockstep import Hub, LockstepFakes
+from coopenv.cars.transport import Transport
 
 PATIENT = """
 [safety] # a machine that runs many tests at once is slow

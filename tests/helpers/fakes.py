@@ -14,11 +14,11 @@ from coopenv.cars.backend.binding import bind
 from coopenv.cars.codec import decode, encode, make
 from coopenv.cars.deployment import Car, Deployment, Sensors
 from coopenv.cars.fake.car import Fake, fault_topic
+from coopenv.cars.fake.lockstep import Hub
 from coopenv.cars.gate import GateClock, write_drive
 from coopenv.cars.profile import RESET_TOPIC, SVEA, CarProfile, MotionCommand, Role
 from coopenv.cars.transport import Arrival
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.cars.fake.lockstep import Hub
 
 MARKERS = {"SL1": 1, "SL2": 2, "SL4": 4, "SL5": 5}
 OVERTAKING = (Car(name="svea7", marker=7), Car(name="svea8", marker=6))

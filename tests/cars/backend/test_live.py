@@ -19,10 +19,10 @@ from coopenv.cars.backend.backend import Svea
 from coopenv.cars.backend.drive import Drive
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.fake.car import Fake
+from coopenv.cars.fake.lockstep import Hub
 from coopenv.cars.profile import RESET_TOPIC, SVEA, Role
 from coopenv.cars.transport import Arrival
 from tests.helpers.cars import OVERTAKING, PATIENT, SAFETY, cars, fakes, send_fault, threaded_fakes, write_fleet
-from coopenv.cars.fake.lockstep import Hub
 
 AHEAD = np.array([0.2, 0.0])  # 0.3 m/s of f1
 

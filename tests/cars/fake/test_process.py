@@ -26,6 +26,7 @@ from coopenv.cars.codec import MOST_BYTES, encode, make
 from coopenv.cars.deployment import DeploymentError, Safety, load_deployment
 from coopenv.cars.fake.fleet import FakesError, free_port
 from coopenv.cars.fake.fleet import fakes as fake_processes
+from coopenv.cars.fake.lockstep import Hub
 from coopenv.cars.gate import write_status
 from coopenv.cars.keys import load_signer, load_verifier, make_keys
 from coopenv.cars.profile import SVEA, Limits, Role, presence_of
@@ -34,7 +35,6 @@ from coopenv.cars.zenoh import open_zenoh
 from coopenv.cli.app import app
 from coopenv.cli.svea import next_message
 from tests.helpers.cars import OVERTAKING, fakes, open_fake, write_fleet
-from coopenv.cars.fake.lockstep import Hub
 from tests.helpers.processes import ROOT, mentioning, start, wait_until
 from tests.helpers.wire import free_endpoint, seen_by
 
@@ -59,10 +59,10 @@ def test_a_gate_obeys_the_given_senders(fleet: Path) -> None:
     make_keys(keys, ["svea7", "svea1", "station"])
     with fakes(fleet, station="svea7") as (hub, _):
         here, verifier = hub.connect(), load_verifier(keys)
-        own, other = (
-            Gates(here, ("svea7",), LIMITS, load_signer(keys, name), verifier) for name in ("svea7", "station")
-        )
-        wait_until(lambda: other.states["svea7"].state == own.states["svea7"].state == "disarmed")
+        signers = [load_signer(keys, name) for name in ("svea7", "station")]
+        own, other = (Gates(here, ("svea7",), LIMITS, signer, verifier, clock=hub.clock) for signer in signers)
+        hub.clock.sleep(0.3)
+        assert other.states["svea7"].state == own.states["svea7"].state == "disarmed"
         with pytest.raises(CoopenvError, match="svea7"):
             other.begin()
         assert own.states["svea7"].state == "disarmed"
