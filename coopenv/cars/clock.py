@@ -3,21 +3,12 @@
 import threading
 import time
 from collections.abc import Callable
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 from coopenv.cars.gate import GateClock
 
-
-class Repetition(Protocol):
-    """An action that a clock repeats."""
-
-    def is_alive(self) -> bool:
-        """Return False after the end."""
-        ...
-
-    def end(self) -> None:
-        """End it."""
-        ...
+End = Callable[[], None]
+"""Ends something that is repeated; may be called again."""
 
 
 class Clock(GateClock):
@@ -37,47 +28,31 @@ class Clock(GateClock):
         """Return after a time, s."""
         time.sleep(seconds)
 
-    def repeat(self, period: float, act: Callable[[], None], name: str) -> Repetition:
+    def repeat(self, period: float, act: Callable[[], None], name: str) -> End:
         """Let an action begin `period` s after the end of the one before, in a thread of that name."""
-        return _Thread(period, act, name)
+        ended = threading.Event()
+
+        def run() -> None:
+            while not ended.wait(period):
+                act()
+
+        def end() -> None:
+            ended.set()
+            thread.join(timeout=1.0)
+
+        thread = threading.Thread(target=run, name=name, daemon=True)
+        thread.start()
+        return end
 
 
 CLOCK = Clock()
 
 
-class _Thread(threading.Thread):
-    def __init__(self, period: float, act: Callable[[], None], name: str) -> None:
-        super().__init__(name=name, daemon=True)
-        self._period, self._act, self._ended = period, act, threading.Event()
-        self.start()
-
-    def run(self) -> None:
-        while not self._ended.wait(self._period):
-            self._act()
-
-    def end(self) -> None:
-        self._ended.set()
-        self.join(timeout=1.0)
-
-
-class Participant(Protocol):
-    """A program on a simulated clock, such as a fake car."""
-
-    @property
-    def next(self) -> int:
-        """Steady time of its next event, ns."""
-        ...
-
-    def advance(self) -> None:
-        """Do all that is due, and move `next` into the future."""
-        ...
-
-
 class SimulatedClock(Clock):
-    """Time that passes only in `sleep`: participants do what is due until then, each event at its time.
+    """Time that passes only in `sleep`: what is due until then happens first, each event at its time.
 
-    All run in the thread that sleeps, the participants at equal times in the order of their joining. So a drive depends
-    on its seeds alone, and neither on the load of the computer nor on its speed. Computing takes no time.
+    All runs in the thread that sleeps; of equal times the participant that has joined first comes first. So a drive
+    depends on its seeds alone, and neither on the load of the computer nor on its speed. Computing takes no time.
     """
 
     simulated = True
@@ -85,38 +60,37 @@ class SimulatedClock(Clock):
     def __init__(self) -> None:
         """Begin at the computer's present time."""
         self._now, begin = 10**9, time.time_ns()
-        self._participants: list[Participant] = []
+        self._participants: list[tuple[Callable[[], int], Callable[[], None]]] = []
         super().__init__(lambda: begin + self._now, lambda: self._now)
 
-    def join(self, participant: Participant) -> None:
-        """Let a program take part from now on."""
+    def join(self, due: Callable[[], int], act: Callable[[], None]) -> End:
+        """Let an action happen whenever it is due: `due` returns the steady time, ns, which the action moves on."""
+        participant = due, act
         self._participants.append(participant)
+
+        def end() -> None:
+            self._participants = [other for other in self._participants if other is not participant]
+
+        return end
 
     def sleep(self, seconds: float) -> None:
         """Let a time pass, s."""
         until = self._now + round(seconds * 1e9)
-        while (first := min(self._participants, key=lambda one: one.next, default=None)) and first.next <= until:
-            self._now = max(self._now, first.next)
-            first.advance()
+        while self._participants:
+            due, act = min(((due(), act) for due, act in self._participants), key=lambda event: event[0])
+            if due > until:
+                break
+            self._now = max(self._now, due)
+            act()
         self._now = until
 
-    def repeat(self, period: float, act: Callable[[], None], name: str) -> Repetition:
+    def repeat(self, period: float, act: Callable[[], None], name: str) -> End:
         """Repeat an action at each period, s."""
-        return _Repeated(self._participants, self._now, round(period * 1e9), act)
+        due, step = self._now, round(period * 1e9)
 
+        def again() -> None:
+            nonlocal due
+            due += step
+            act()
 
-class _Repeated:
-    def __init__(self, among: list[Participant], now: int, period: int, act: Callable[[], None]) -> None:
-        self._among, self.next, self._period, self._act = among, now + period, period, act
-        among.append(self)
-
-    def advance(self) -> None:
-        self.next += self._period
-        self._act()
-
-    def is_alive(self) -> bool:
-        return self in self._among
-
-    def end(self) -> None:
-        if self in self._among:
-            self._among.remove(self)
+        return self.join(lambda: due + step, again)

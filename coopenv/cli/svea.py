@@ -54,9 +54,7 @@ def demo(
     ] = False,
     real_time: Annotated[
         bool,
-        typer.Option(
-            "--real-time", help="Run a router and a process per car, in real time on this computer."
-        ),
+        typer.Option("--real-time", help="Run a router and a process per car, in real time on this computer."),
     ] = False,
     overrides: options.Overrides = None,
 ) -> None:

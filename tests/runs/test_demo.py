@@ -262,7 +262,7 @@ def test_a_car_that_is_killed_ends_the_run_with_a_status_of_its_own(tmp_path: Pa
     with fake_processes(mine) as endpoint:
         command = ("svea", "run", "mine.toml", "--connect", endpoint, "--arm", "--policy", "route_follower")
         station = start((*COOPENV, *command, "--record", "drive.mcap", "--no-figures"), tmp_path)
-        wait_until(lambda: (tmp_path / "drive.mcap").exists() and (tmp_path / "drive.mcap").stat().st_size > 100_000)
+        wait_until(lambda: (tmp_path / "drive.mcap").exists() and (tmp_path / "drive.mcap").stat().st_size > ENOUGH)
         with closing(open_zenoh("client", [endpoint])) as here:
             here.publish(fault_topic("svea1"), encode(make("std_msgs/msg/String", data="kill@0")), reliable=True)
             printed, errors = station.communicate(timeout=DEADLOCK)

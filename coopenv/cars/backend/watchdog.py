@@ -223,7 +223,7 @@ class Watchdog:
         self._missed = 0
         self._present = dict.fromkeys(map(presence_of, cars), True)
         self._repeated, self._looked, self._stalled = 0.0, self._clock.seconds(), False
-        self._looks = self._clock.repeat(PERIOD, self._look, "coopenv watchdog")
+        self._closed, self._end = False, self._clock.repeat(PERIOD, self._look, "coopenv watchdog")
 
     def forget(self) -> None:
         """Clear the last stop, so that cars can be armed."""
@@ -232,7 +232,7 @@ class Watchdog:
 
     def arm(self) -> None:
         """Watch the cars from now on. Raises CoopenvError: the watchdog has ended."""
-        if not self._looks.is_alive():
+        if self._closed:
             raise CoopenvError("not armed: the watchdog has ended")
         with self._lock:
             self._armed, self._beat, self._missed = True, None, 0
@@ -266,7 +266,8 @@ class Watchdog:
 
     def close(self) -> None:
         """Look no more."""
-        self._looks.end()
+        self._closed = True
+        self._end()
 
     def _look(self) -> None:
         before, self._looked = self._looked, self._clock.seconds()

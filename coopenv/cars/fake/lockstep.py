@@ -1,7 +1,7 @@
 """Fake cars and stations in lockstep: one process, one simulated clock, and a network within the process."""
 
-import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,78 +18,68 @@ Matcher = Callable[[str], bool]
 
 
 class Hub:
-    """A network within this process."""
+    """A network within this process; messages are delivered in the sender's thread."""
 
     def __init__(self, clock: Clock = CLOCK) -> None:
         """Begin without connections; `clock` gives the times of reception."""
-        self.clock, self._lock = clock, threading.RLock()
-        self._subscribers: list[tuple[Matcher, Callback, object]] = []
-        self._watchers: list[tuple[Matcher, Change, object]] = []
-        self._present: list[tuple[str, object]] = []
+        self.clock, self.ends = clock, list[HubTransport]()
 
     def connect(self) -> "HubTransport":
         """Return a connection."""
-        return HubTransport(self)
+        self.ends.append(end := HubTransport(self))
+        return end
+
+    @property
+    def present(self) -> set[str]:
+        """Announced names."""
+        return {name for end in self.ends for name in end.names}
+
+    def notify(self, before: set[str]) -> None:
+        """Call the watchers of names that have come or gone."""
+        for name in sorted(before ^ self.present):
+            for end in [*self.ends]:
+                for callback in [callback for matches, callback in end.watched if matches(name)]:
+                    callback(name, name not in before)
 
 
 class HubTransport:
-    """A connection to a hub; messages are delivered in the sender's thread."""
+    """A connection to a hub, see `Transport`."""
 
     def __init__(self, hub: Hub) -> None:
         """Connect."""
-        self._hub = hub
-        self._closed = False
+        self._hub, self.names = hub, list[str]()
+        self.subscribed, self.watched = list[tuple[Matcher, Callback]](), list[tuple[Matcher, Change]]()
 
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
     ) -> None:
         """Deliver a message."""
-        arrival = Arrival(topic, payload, self._hub.clock.wall(), attachment)
-        with self._hub._lock:
-            called = [callback for matches, callback, _ in self._hub._subscribers if matches(topic)]
-        for callback in called if not self._closed else ():
-            callback(arrival)
+        arrival, ends = Arrival(topic, payload, self._hub.clock.wall(), attachment), [*self._hub.ends]
+        for end in ends if self in ends else ():
+            for callback in [callback for matches, callback in end.subscribed if matches(topic)]:
+                callback(arrival)
 
     def subscribe(self, pattern: str, callback: Callback) -> None:
-        """Subscribe, see `Transport`."""
-        with self._hub._lock:
-            self._hub._subscribers.append((matcher(pattern), callback, self))
+        """Subscribe."""
+        self.subscribed.append((matcher(pattern), callback))
 
     def announce(self, name: str) -> None:
-        """Announce, see `Transport`."""
-        with self._hub._lock:
-            new = all(name != known for known, _ in self._hub._present)
-            self._hub._present.append((name, self))
-        if new:
-            self._notify(name, True)
+        """Announce."""
+        before = self._hub.present
+        self.names.append(name)
+        self._hub.notify(before)
 
     def watch(self, pattern: str, callback: Change) -> None:
-        """Watch, see `Transport`."""
-        matches = matcher(pattern)
-        with self._hub._lock:
-            self._hub._watchers.append((matches, callback, self))
-            there = {name for name, _ in self._hub._present if matches(name)}
-        for name in sorted(there):
+        """Watch."""
+        self.watched.append((matcher(pattern), callback))
+        for name in sorted(filter(matcher(pattern), self._hub.present)):
             callback(name, True)
 
     def close(self) -> None:
         """Leave the hub."""
-        hub = self._hub
-        with hub._lock:
-            self._closed = True
-            hub._subscribers = [entry for entry in hub._subscribers if entry[2] is not self]
-            hub._watchers = [entry for entry in hub._watchers if entry[2] is not self]
-            before = {name for name, _ in hub._present}
-            hub._present = [entry for entry in hub._present if entry[1] is not self]
-            gone = before - {name for name, _ in hub._present}
-        for name in sorted(gone):
-            self._notify(name, False)
-
-    def _notify(self, name: str, there: bool) -> None:
-        with self._hub._lock:
-            called = [callback for matches, callback, _ in self._hub._watchers if matches(name)]
-        for callback in called:
-            callback(name, there)
+        before = self._hub.present
+        self._hub.ends = [end for end in self._hub.ends if end is not self]
+        self._hub.notify(before)
 
 
 class LockstepFakes:
@@ -118,10 +108,9 @@ class LockstepFakes:
         """The network, and the cars by name."""
         for car in fleet.cars:
             link = self.hub.connect()
-            made = self.cars[car.name] = prepare_fake(path, car.name, station=station)(
-                link, seed=seed, clock=self.clock
-            )
-            self.clock.join(made)
+            made = prepare_fake(path, car.name, station=station)(link, seed=seed, clock=self.clock)
+            self.cars[car.name] = made
+            self.clock.join(partial(getattr, made, "next"), made.advance)
             if fleet.profile.sees_frames and car.landmark is None:
                 camera = Calibration.of(made.world.scenario.cameras[made.world.vehicle])
                 reader = FrameReader(car.name, fleet.profile, camera, link)

@@ -185,7 +185,7 @@ class Yard:
         self.links = {car: GateConnection(Gate(car, USUAL, clock), self.hub.connect()) for car in ("a", "b")}
         self.gates = Gates(self.hub.connect(), ("a", "b"), USUAL, None, clock=clock)
         self.publish()
-        self.speaking = clock.repeat(0.01, self.publish, "gates")
+        self.end_speaking = clock.repeat(0.01, self.publish, "gates")
 
     def publish(self) -> None:
         for link in self.links.values():
@@ -256,7 +256,7 @@ def test_what_a_gate_has_said_before_is_not_believed_again(yard: Yard) -> None:
     yard.hub.connect().publish(topic, first.payload)
     assert yard.gates.states["a"] == before and yard.gates.dropped["a"]["out of order"] == 1
     last = heard[-1].payload
-    yard.speaking.end()
+    yard.end_speaking()
     yard.clock.sleep(LATE * 1e-9 + 0.1)
     before = yard.gates.states["a"]
     yard.hub.connect().publish(topic, last)
@@ -337,7 +337,7 @@ def test_a_network_that_fails_does_not_end_the_watchdog(clock: Clock, monkeypatc
     dog.forget()
     dog.arm()
     dog.close()
-    yard.speaking.end()
+    yard.end_speaking()
 
 
 def test_nothing_is_armed_without_a_watchdog(guard: tuple[Yard, Watchdog, LinkMonitor]) -> None:
