@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from coopenv.cars.gate import GateClock
 
+POLL = 0.01  # s
 End = Callable[[], None]
 """Ends something that is repeated; may be called again."""
 
@@ -16,10 +17,6 @@ class Clock(GateClock):
 
     simulated: ClassVar[bool] = False
 
-    def __init__(self, wall: Callable[[], int] = time.time_ns, steady: Callable[[], int] = time.monotonic_ns) -> None:
-        """Take the two times of a gate's clock, ns."""
-        super().__init__(wall, steady)
-
     def seconds(self) -> float:
         """Return the steady time, s."""
         return self.steady() * 1e-9
@@ -27,6 +24,12 @@ class Clock(GateClock):
     def sleep(self, seconds: float) -> None:
         """Return after a time, s."""
         time.sleep(seconds)
+
+    def wait(self, ready: Callable[[], object], patience: float) -> None:
+        """Return as soon as something is true, after some s at most."""
+        until = self.seconds() + patience
+        while not ready() and self.seconds() < until:
+            self.sleep(POLL)
 
     def repeat(self, period: float, act: Callable[[], None], name: str) -> End:
         """Let an action begin `period` s after the end of the one before, in a thread of that name."""

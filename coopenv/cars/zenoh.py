@@ -13,6 +13,7 @@ from weakref import WeakSet
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, needing
+from coopenv.cars.clock import CLOCK
 from coopenv.cars.deployment import Deployment, DeploymentError
 from coopenv.cars.transport import (
     SECURE,
@@ -33,6 +34,8 @@ RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor":
 
 class Zenoh:
     """A Zenoh session as a transport."""
+
+    clock = CLOCK
 
     def __init__(self, session: Any, module: Any) -> None:
         self.session, self.library = session, module

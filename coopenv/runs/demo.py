@@ -66,20 +66,16 @@ def links_report(backend: Svea, out: Console) -> None:
     for notes, here, there in _links(backend):
         table.add_row(notes["name"], notes["gate"], f"{1e3 * notes['clock_offset']:.1f} ms", str(here), str(there))
     out.print(table)
-    late = _late(backend, backend.pacer.late(0.99))
+    late = 1e3 * backend.pacer.late(0.99)
     out.print(
-        f"{health.received} messages, {health.ticks} ticks, {backend.pacer.missed} missed deadlines{late}",
+        f"{health.received} messages, {health.ticks} ticks, {backend.pacer.missed} missed deadlines, "
+        f"wake-up lateness p99 {late:.2f} ms",
         soft_wrap=True,
     )
     if left_out := [f"{name} {count}" for name, count in backend.refused.items() if count]:
         out.print(f"Left out: {', '.join(left_out)}", soft_wrap=True)
     if backend.watchdog.trip is not None:
         out.print(f"Stopped: {backend.watchdog.trip.reason}", soft_wrap=True)
-
-
-def _late(backend: Svea, seconds: float) -> str:
-    """Return how late a computer woke up, as the end of a line; empty by a simulated clock."""
-    return "" if backend.capabilities.simulated_clock else f", wake-up lateness p99 {1e3 * seconds:.2f} ms"
 
 
 def check_alive(backend: Svea) -> None:
@@ -164,7 +160,7 @@ class Demo:
     deployment: Path | None = None
     """One's own deployment file, whose cars are fakes; `environment` is its environment then."""
     real_time: bool = False
-    """Let router and cars be processes in real time; else all is in this one, by a simulated clock."""
+    """Run a router and a process per car in real time, and not all in this one on a simulated clock."""
     time: float = field(default=0.0, init=False)
     """Driven time, s."""
     decisions: int = field(default=0, init=False)
@@ -226,9 +222,12 @@ class Demo:
             out.print(side_by_side(backend.scenario.vehicle_names, backends))
             out.print(f"RMSE: after {STEADY_FROM:g} s, up to the vehicle's end. SE: standard error over the seeds.")
             out.print("Hidden: frames in which a static landmark is not seen.")
-        late = _late(backend, float(np.quantile(self.delays, 0.99)) if self.delays else 0.0)
-        late += f" over {len(self.delays)} ticks" if late else ""
-        out.print(f"{self.time:.1f} s driven, {self.missed} of {self.decisions} deadlines missed{late}", soft_wrap=True)
+        late = 1e3 * float(np.quantile(self.delays, 0.99)) if self.delays else 0.0
+        out.print(
+            f"{self.time:.1f} s driven, {self.missed} of {self.decisions} deadlines missed, "
+            f"wake-up lateness p99 {late:.2f} ms over {len(self.delays)} ticks",
+            soft_wrap=True,
+        )
         out.print(
             f"The drive, bit for bit: coopenv run {quote(str(drive))} --steady-from {STEADY_FROM:g}", soft_wrap=True
         )

@@ -78,7 +78,7 @@ def threaded_fakes(path: Path) -> Iterator[Hub]:
 
 def cars(path: Path, hub: Hub, **options: Any) -> Svea:
     """Return the cars as a backend, on the clock of their network."""
-    return open_svea(path, transport=hub.connect(), clock=hub.clock, **options)
+    return open_svea(path, transport=hub.connect(), **options)
 
 
 def send_fault(hub: Hub, car: str, fault: str) -> None:

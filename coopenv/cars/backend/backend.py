@@ -3,7 +3,7 @@
 import gc
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,6 @@ from coopenv.cars.backend.buffers import ROLES, StatusBoard
 from coopenv.cars.backend.drive import PRESENCE, DriveRecorder, RecordedTransport, head_of
 from coopenv.cars.backend.station import UNTRIED, Gates, Pacer, Station
 from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog, bearing_nis, since
-from coopenv.cars.clock import CLOCK, Clock
 from coopenv.cars.codec import encode, make, warm_up
 from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.keys import Signer, Verifier, load_keys
@@ -44,7 +43,6 @@ FIRST_MESSAGES_TIME = 3.0  # s to wait for first messages at the first reset
 CAMERA_INFO_TIME = 1.5  # s to wait for the calibration of a camera; some publish none
 READY_TIME = 2.0  # s to wait until all conditions of arming hold at once; cars publish theirs once a second
 SETTLE = 0.5  # s for fakes to settle at their start
-POLL = 0.02  # s
 
 
 class Svea:
@@ -62,26 +60,24 @@ class Svea:
         signer: Signer | None = None,
         verifier: Verifier | None = None,
         recorder: DriveRecorder | None = None,
-        clock: Clock = CLOCK,
     ) -> None:
         """Listen to the cars.
 
         Args:
             deployment: the fleet.
             binding: vehicles and markers of its cars.
-            transport: the network; closed with the backend.
+            transport: the network, by whose clock ticks are due; closed with the backend.
             signer: signs sent messages (None: they are not signed).
             verifier: knows the cars' keys (None: signatures do not count).
             recorder: records the messages of the ticks, and the reasons of stops.
-            clock: by which ticks are due and messages have ages; that of the cars, if it is simulated.
         """
         self.deployment, self.binding, self.scenario = deployment, binding, binding.scenario
-        self._transport, self.recorder, self._clock = transport, recorder, clock
+        self._transport, self.recorder, self._clock = transport, recorder, transport.clock
         self.capabilities = Capabilities(
             truth=deployment.sensors.truth,
             driven=True,
             real_time=True,
-            simulated_clock=clock.simulated,
+            simulated_clock=transport.clock.simulated,
             ticks=None,
             batched=False,
             estimated=None if not binding.remote else binding.local,
@@ -89,7 +85,7 @@ class Svea:
         self.health = Health()
         self.refused: dict[str, int] = {}
         """Samples that were not used, by reason."""
-        self.pacer = Pacer(1.0 / self.scenario.rates.camera, self.scenario.ticks_per_decision, clock)
+        self.pacer = Pacer(1.0 / self.scenario.rates.camera, self.scenario.ticks_per_decision, self._clock)
         self._origin = np.array(self.scenario.map.origin)
         landmarks = self.scenario.landmarks
         self._landmarks = np.array([mark.position for mark in landmarks]).reshape(-1, 3) - self._origin
@@ -104,9 +100,9 @@ class Svea:
         self.intake, self._assembler = Intake(binding, deployment.sensors), Assembler(binding)
         identity, zenoh = deployment.security.identity, deployment.network.kind == "zenoh"
         signers = {profile.topic_of(name, role): (name, identity) for name in fleet for role in BROADCAST}
-        self.station = Station(transport, self.intake.topics, verifier, signers, clock)
-        self.gates = Gates(transport, cars, deployment.limits, signer, verifier, profile, zenoh, clock)
-        self.board = StatusBoard(transport, cars, deployment.remote, deployment.conditions, profile, clock)
+        self.station = Station(transport, self.intake.topics, verifier, signers)
+        self.gates = Gates(transport, cars, deployment.limits, signer, verifier, profile, zenoh)
+        self.board = StatusBoard(transport, cars, deployment.remote, deployment.conditions, profile)
         self.monitor = LinkMonitor(deployment.safety.judge)
         self.watchdog = Watchdog(
             *(deployment.safety, self.station, self.gates, self.monitor, cars, others, self._odometry),
@@ -152,17 +148,11 @@ class Svea:
         """Wait a limited time for messages of the cars: only driving needs them."""
         topics = [self.binding.profile.topic_of(name, role) for name in self._local for role in self._odometry]
         patience = 0.0 if self._received_once else FIRST_MESSAGES_TIME
-        self._wait(lambda: all(self.station.silence(topic) < 1.0 for topic in topics), patience)
+        self._clock.wait(lambda: all(self.station.silence(topic) < 1.0 for topic in topics), patience)
         if arm:
-            self._wait(lambda: self.board.calibrations.keys() >= self._local.keys(), CAMERA_INFO_TIME)
+            self._clock.wait(lambda: self.board.calibrations.keys() >= self._local.keys(), CAMERA_INFO_TIME)
         self._received_once = True
         self.drain()
-
-    def _wait(self, ready: Callable[[], bool], patience: float) -> None:
-        """Wait for something to become true, s at most."""
-        until = self._clock.seconds() + patience
-        while self._clock.seconds() < until and not ready():
-            self._clock.sleep(POLL)
 
     def _arm(self, release: bool) -> None:
         """Open the gates, with `release` also of cars that another station has stopped, and watch the cars.
@@ -170,7 +160,7 @@ class Svea:
         Raises:
             CoopenvError: a condition of arming does not hold.
         """
-        self._wait(lambda: self._obstacle() is None, READY_TIME)
+        self._clock.wait(lambda: self._obstacle() is None, READY_TIME)
         if found := self._obstacle():
             raise CoopenvError(f"not armed: {found}")
         if (kind := self.deployment.network.kind) != "zenoh":
@@ -322,7 +312,6 @@ def open_svea(
     transport: Transport | None = None,
     connect: str | None = None,
     watch: bool = False,
-    clock: Clock = CLOCK,
 ) -> Svea:
     """Return the cars of a deployment file as a backend.
 
@@ -335,7 +324,6 @@ def open_svea(
         transport: a network that is open already (None: that of the file).
         connect: endpoint in place of the file's.
         watch: only receive: nothing is sent, fakes are not moved, and no car can be armed.
-        clock: see `Svea`.
 
     A `DataWarning` names landmarks and vehicles that cameras cannot identify.
 
@@ -360,8 +348,8 @@ def open_svea(
     if recorder is not None:
         roles, names = (Role.GATE, Role.STOP, *ROLES), [binding.names[i] for i in binding.local]
         aside = [binding.profile.topic_of(name, role) for name in names for role in roles]
-        link = RecordedTransport(link, recorder, aside, clock)
-    return Svea(deployment, binding, link, signer, verifier, recorder, clock)
+        link = RecordedTransport(link, recorder, aside)
+    return Svea(deployment, binding, link, signer, verifier, recorder)
 
 
 def scenario_of(deployment: Deployment, environment: str | None, overrides: Mapping[str, Any]) -> Scenario:

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, shown
-from coopenv.cars.clock import CLOCK, Clock
 from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Remote
 from coopenv.cars.profile import SVEA, CarProfile, Role
@@ -193,13 +192,7 @@ class StatusBoard:
     """Last condition of each car, and the reasons to stop it since arming."""
 
     def __init__(
-        self,
-        transport: Transport,
-        cars: tuple[str, ...],
-        remote: Remote,
-        needed: bool,
-        profile: CarProfile = SVEA,
-        clock: Clock = CLOCK,
+        self, transport: Transport, cars: tuple[str, ...], remote: Remote, needed: bool, profile: CarProfile = SVEA
     ) -> None:
         """Subscribe to the conditions of the cars.
 
@@ -209,9 +202,8 @@ class StatusBoard:
             remote: channels of their remote controls.
             needed: True if cars must send the conditions of their profile.
             profile: make of the cars.
-            clock: of the ages.
         """
-        self._lock, self._clock = threading.Lock(), clock
+        self._lock, self._clock = threading.Lock(), transport.clock
         self._remote, self._needed, self._profile = remote, needed, profile
         self._conditions_needed = tuple(map(Role, profile.conditions)) if needed else ()
         self._topics = {profile.topic_of(car, role): (car, role) for car in cars for role in ROLES}

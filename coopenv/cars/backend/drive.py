@@ -24,7 +24,6 @@ from coopenv.base.installation import install_command, version
 from coopenv.cars.backend.assembler import Assembler, Intake
 from coopenv.cars.backend.binding import OPTIONS, Binding, bind, reset_options
 from coopenv.cars.backend.station import refusal
-from coopenv.cars.clock import CLOCK, Clock
 from coopenv.cars.codec import STOPPED, TICK, decode, encode, header, make, stamp_of
 from coopenv.cars.deployment import Deployment, parse_deployment
 from coopenv.cars.profile import STOPPED_TOPIC, TICK_TOPIC, presence_of
@@ -263,18 +262,15 @@ class RecordedTransport:
     Messages of which ticks are made are recorded by the backend, in the order in which it takes them.
     """
 
-    def __init__(
-        self, transport: Transport, recorder: DriveRecorder, aside: Iterable[str] = (), clock: Clock = CLOCK
-    ) -> None:
+    def __init__(self, transport: Transport, recorder: DriveRecorder, aside: Iterable[str] = ()) -> None:
         """Wrap a transport.
 
         Args:
             transport: the network.
             recorder: records all messages that are sent, and presence.
             aside: topics of which no ticks are made: what comes on them is written at once.
-            clock: times of what is sent, and of presence.
         """
-        self._transport, self._recorder, self._wall = transport, recorder, clock.wall
+        self._transport, self._recorder, self.clock = transport, recorder, transport.clock
         self.subscribe, self.announce, self.watch = transport.subscribe, transport.announce, transport.watch
         self.close = transport.close
         for topic in aside:
@@ -286,11 +282,11 @@ class RecordedTransport:
     ) -> None:
         """Send, see `Transport`, and record the message."""
         self._transport.publish(topic, payload, attachment, urgent=urgent, reliable=reliable)
-        self._recorder.write(topic, payload, self._wall())
+        self._recorder.write(topic, payload, self.clock.wall())
 
     def _write_aside(self, arrival: Arrival) -> None:
         if not refusal(arrival):
             self._recorder.write(arrival.topic, arrival.payload, arrival.received)
 
     def _write_presence(self, name: str, there: bool) -> None:
-        self._recorder.write(name, encode(make(PRESENCE, data=there)), self._wall())
+        self._recorder.write(name, encode(make(PRESENCE, data=there)), self.clock.wall())

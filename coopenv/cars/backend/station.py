@@ -35,7 +35,6 @@ class Station:
         topics: Iterable[str],
         verifier: Verifier | None,
         signers: Mapping[str, Collection[str]],
-        clock: Clock = CLOCK,
     ) -> None:
         """Subscribe.
 
@@ -44,9 +43,8 @@ class Station:
             topics: topics to subscribe to.
             verifier: checks signatures; None: nothing is signed.
             signers: identities that may sign a topic, for topics that could be forged.
-            clock: of the silence of topics.
         """
-        self._lock, self._clock = threading.Lock(), clock
+        self._lock, self._clock = threading.Lock(), transport.clock
         self._waiting: dict[str, deque[Arrival]] = {topic: deque(maxlen=MOST_WAITING) for topic in topics}
         self._last: dict[str, float] = {}
         self._verifier, self._signers = verifier, signers
@@ -145,10 +143,10 @@ class Pacer:
 
 
 PATIENCE = 1.0  # s for a gate to answer
+RETRY = 0.05  # s between armings
 STATUS_TIME = 0.5  # s for a new status of every gate
 LATE, AHEAD = 500_000_000, 50_000_000  # ns by which a status may be old, or ahead of this clock
 OLD = 1.0  # s without a status after which a gate counts as gone
-POLL = 0.01  # s
 OPEN = ("armed", "timed_out")
 """States of a gate that takes commands: after a time-out the car stands until the next one."""
 
@@ -184,7 +182,6 @@ class Gates:
         verifier: Verifier | None = None,
         profile: CarProfile = SVEA,
         probed: bool = True,
-        clock: Clock = CLOCK,
     ) -> None:
         """Receive from the gates; with a verifier only signed messages.
 
@@ -192,8 +189,8 @@ class Gates:
         """
         self._transport, self._limits, self._signer, self._verifier = transport, limits, signer, verifier
         self.profile, self._probed, self._lock = profile, probed, threading.Lock()
-        self.clock = clock
-        self._states = {car: GateState(clock=clock) for car in cars}
+        self.clock = transport.clock
+        self._states = {car: GateState(clock=self.clock) for car in cars}
         self._before: dict[str, Counter[str]] = {}
         self._cars = {self.profile.topic_of(car, Role.GATE): car for car in cars}
         self._stopping = False
@@ -279,7 +276,7 @@ class Gates:
                 if self._probed:  # like the arming, so that it comes before it
                     self._transport.publish(*neutral_command(self.profile, car, self.clock), reliable=True)
                 self._arm(car, True, states[car].nonce)  # of that status: a later stop invalidates it
-            self.clock.sleep(5 * POLL)
+            self.clock.sleep(RETRY)
         with self._lock:
             self._stopping = False
             self.stopped_by_others.clear()
@@ -288,9 +285,7 @@ class Gates:
     def fresh_states(self, patience: float = STATUS_TIME) -> dict[str, GateState]:
         """Return a status of each gate, waiting `patience` s for new ones. Raises CoopenvError: a gate is silent."""
         asked, known = self.clock.seconds(), {car: counts.copy() for car, counts in self.dropped.items()}
-        until = asked + patience
-        while any(state.received < asked for state in self.states.values()) and self.clock.seconds() < until:
-            self.clock.sleep(POLL)
+        self.clock.wait(lambda: all(state.received >= asked for state in self.states.values()), patience)
         for car, state in self.states.items():
             if state.age <= OLD:
                 continue

@@ -11,75 +11,57 @@ from coopenv.cars.fake.car import Fake
 from coopenv.cars.fake.fleet import fleet_of_fakes, prepare_fake
 from coopenv.cars.profile import Role
 from coopenv.cars.see import FrameReader
-from coopenv.cars.transport import Arrival, Callback, Change, matcher
+from coopenv.cars.transport import Arrival, Callback, HeartbeatTransport, matcher
 from coopenv.cars.vision import Calibration
-
-Matcher = Callable[[str], bool]
 
 
 class Hub:
     """A network within this process; messages are delivered in the sender's thread."""
 
     def __init__(self, clock: Clock = CLOCK) -> None:
-        """Begin without connections; `clock` gives the times of reception."""
+        """Begin without connections; `clock` is that of all ends."""
         self.clock, self.ends = clock, list[HubTransport]()
 
     def connect(self) -> "HubTransport":
         """Return a connection."""
-        self.ends.append(end := HubTransport(self))
+        self.ends = [*self.ends, end := HubTransport(self)]
         return end
 
-    @property
-    def present(self) -> set[str]:
-        """Announced names."""
-        return {name for end in self.ends for name in end.names}
 
-    def notify(self, before: set[str]) -> None:
-        """Call the watchers of names that have come or gone."""
-        for name in sorted(before ^ self.present):
-            for end in [*self.ends]:
-                for callback in [callback for matches, callback in end.watched if matches(name)]:
-                    callback(name, name not in before)
-
-
-class HubTransport:
+class HubTransport(HeartbeatTransport):
     """A connection to a hub, see `Transport`."""
 
     def __init__(self, hub: Hub) -> None:
         """Connect."""
-        self._hub, self.names = hub, list[str]()
-        self.subscribed, self.watched = list[tuple[Matcher, Callback]](), list[tuple[Matcher, Change]]()
+        super().__init__()
+        self._hub, self.clock = hub, hub.clock
+        self._subscribed = list[tuple[Callable[[str], bool], Callback]]()
 
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
     ) -> None:
         """Deliver a message."""
-        arrival, ends = Arrival(topic, payload, self._hub.clock.wall(), attachment), [*self._hub.ends]
-        for end in ends if self in ends else ():
-            for callback in [callback for matches, callback in end.subscribed if matches(topic)]:
+        arrival = Arrival(topic, payload, self.clock.wall(), attachment)
+        for end in () if self._closed.is_set() else self._hub.ends:
+            for callback in [callback for matches, callback in end._subscribed if matches(topic)]:
                 callback(arrival)
 
     def subscribe(self, pattern: str, callback: Callback) -> None:
         """Subscribe."""
-        self.subscribed.append((matcher(pattern), callback))
+        self._subscribed.append((matcher(pattern), callback))
 
-    def announce(self, name: str) -> None:
-        """Announce."""
-        before = self._hub.present
-        self.names.append(name)
-        self._hub.notify(before)
+    def _send_heartbeat(self, name: str, payload: bytes) -> None:
+        for end in self._hub.ends:
+            end.heartbeat(name, payload)
 
-    def watch(self, pattern: str, callback: Change) -> None:
-        """Watch."""
-        self.watched.append((matcher(pattern), callback))
-        for name in sorted(filter(matcher(pattern), self._hub.present)):
-            callback(name, True)
+    def _receive_heartbeats(self) -> None:
+        for end in self._hub.ends:
+            for name in end._own:
+                self.heartbeat(name, b"+" + end._self)
 
-    def close(self) -> None:
-        """Leave the hub."""
-        before = self._hub.present
+    def _end(self) -> None:
+        self._closed.set()
         self._hub.ends = [end for end in self._hub.ends if end is not self]
-        self._hub.notify(before)
 
 
 class LockstepFakes:
@@ -118,4 +100,4 @@ class LockstepFakes:
 
     def station(self, environment: str | None = None, **options: Any) -> Svea:
         """Return a station of these cars as a backend; arguments and errors are those of `open_svea`."""
-        return open_svea(self._path, environment, transport=self.hub.connect(), clock=self.clock, **options)
+        return open_svea(self._path, environment, transport=self.hub.connect(), **options)

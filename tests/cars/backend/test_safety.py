@@ -183,7 +183,7 @@ class Yard:
     def __init__(self, clock: Clock) -> None:
         self.hub, self.clock = Hub(clock), clock
         self.links = {car: GateConnection(Gate(car, USUAL, clock), self.hub.connect()) for car in ("a", "b")}
-        self.gates = Gates(self.hub.connect(), ("a", "b"), USUAL, None, clock=clock)
+        self.gates = Gates(self.hub.connect(), ("a", "b"), USUAL, None)
         self.publish()
         self.end_speaking = clock.repeat(0.01, self.publish, "gates")
 
@@ -281,7 +281,7 @@ def refuse(*_message: object) -> None:
 
 def watchdog_of(yard: Yard, monitor: LinkMonitor) -> Watchdog:
     """Return the watchdog of a yard, which needs the wheels of a."""
-    station = Station(yard.hub.connect(), [WHEEL], None, {}, yard.clock)
+    station = Station(yard.hub.connect(), [WHEEL], None, {})
     return Watchdog(Safety(odometry_age=0.3), station, yard.gates, monitor, ("a",), (), (Role.WHEEL,), 10.0)
 
 
@@ -356,7 +356,7 @@ class Talk:
     def __init__(self, needed: bool = True) -> None:
         self.clock = SimulatedClock()
         self.hub = Hub(self.clock)
-        self.board = StatusBoard(self.hub.connect(), (CAR,), Remote(), needed, clock=self.clock)
+        self.board = StatusBoard(self.hub.connect(), (CAR,), Remote(), needed)
         self.network = self.hub.connect()
 
     def say(self, role: Role, age: float, **fields: Any) -> None:

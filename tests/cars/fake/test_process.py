@@ -60,7 +60,7 @@ def test_a_gate_obeys_the_given_senders(fleet: Path) -> None:
     with fakes(fleet, station="svea7") as (hub, _):
         here, verifier = hub.connect(), load_verifier(keys)
         signers = [load_signer(keys, name) for name in ("svea7", "station")]
-        own, other = (Gates(here, ("svea7",), LIMITS, signer, verifier, clock=hub.clock) for signer in signers)
+        own, other = (Gates(here, ("svea7",), LIMITS, signer, verifier) for signer in signers)
         hub.clock.sleep(0.3)
         assert other.states["svea7"].state == own.states["svea7"].state == "disarmed"
         with pytest.raises(CoopenvError, match="svea7"):
