@@ -54,8 +54,8 @@ CLOCK = Clock()
 class SimulatedClock(Clock):
     """Time that passes only in `sleep`: what is due until then happens first, each event at its time.
 
-    All runs in the thread that sleeps; of equal times the participant that has joined first comes first. So a drive
-    depends on its seeds alone, and neither on the load of the computer nor on its speed. Computing takes no time.
+    All runs in the thread that sleeps; at equal times the participant that joined first is first. Computing takes no
+    time, so that a drive depends on its seeds alone, whatever the load.
     """
 
     simulated = True

@@ -111,9 +111,8 @@ MOST_PRESENT, LONGEST = 256, 256
 class HeartbeatTransport(ABC):
     """A transport on a network without presence: its ends send heartbeats of the names that they announce."""
 
-    clock = CLOCK
-
     def __init__(self) -> None:
+        self.clock = CLOCK
         self._self = uuid.uuid4().bytes  # two ends may announce one name, of which one goes
         self._own: list[str] = []
         self._last: dict[tuple[str, bytes], float] = {}

@@ -35,10 +35,8 @@ RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor":
 class Zenoh:
     """A Zenoh session as a transport."""
 
-    clock = CLOCK
-
     def __init__(self, session: Any, module: Any) -> None:
-        self.session, self.library = session, module
+        self.session, self.library, self.clock = session, module, CLOCK
         self._kept: list[Any] = []  # a declaration ends with its last reference
         _sessions().add(self)
 

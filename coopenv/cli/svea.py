@@ -37,8 +37,7 @@ def demo(
         Path | None, typer.Option(help="Or a deployment file of your own, whose cars are fakes (fakes = true).")
     ] = None,
     port: Annotated[
-        int | None,
-        typer.Option(min=1, max=65535, help="With --real-time: port of the router (default: a free one)."),
+        int | None, typer.Option(min=1, max=65535, help="Port of the router of --real-time (default: a free one).")
     ] = None,
     out: Annotated[
         Path | None,
@@ -52,10 +51,7 @@ def demo(
     beside: Annotated[
         bool, typer.Option("--beside", help="Simulate the same seeds, too, and print both side by side.")
     ] = False,
-    real_time: Annotated[
-        bool,
-        typer.Option("--real-time", help="Run a router and a process per car, in real time on this computer."),
-    ] = False,
+    real_time: Annotated[bool, typer.Option("--real-time", help="Run a process per car, and a router.")] = False,
     overrides: options.Overrides = None,
 ) -> None:
     """Let fake cars drive an experiment: table, figures, and a drive that can be run again.
@@ -179,9 +175,7 @@ def health(
         float | None,
         typer.Option(min=0.0, help="s of messages for offset and drift of its clocks (default: 5 with --off-board)."),
     ] = None,
-    read_only: Annotated[
-        bool, typer.Option("--read-only", help="Send nothing: a health check of a container.")
-    ] = False,
+    read_only: Annotated[bool, typer.Option("--read-only", help="Send nothing, as a health check.")] = False,
 ) -> None:
     """Print the next status of a car's gate, and unless --read-only try from outside a neutral command to the wheels.
 

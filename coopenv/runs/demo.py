@@ -199,10 +199,15 @@ class Demo:
         with writing(drive.parent):
             drive.parent.mkdir(parents=True, exist_ok=True)
         with ExitStack() as stack:
-            opened = self._start(fleet, port, stack, log)
+            with compile_notice(log), Progress(log, "starting fake cars"):
+                station: Callable[..., Svea]
+                if self.real_time:
+                    station = partial(open_svea, fleet, connect=stack.enter_context(fakes(fleet, port, self.seed)))
+                else:
+                    station = LockstepFakes(fleet, self.seed).station
             record = stack.enter_context(replacing_file(drive))
             environment = None if self.deployment else self.environment
-            backend = opened(environment, overrides=self.overrides, record=record)
+            backend = station(environment, overrides=self.overrides, record=record)
             stack.callback(backend.close)
             try:
                 if not self._drive(backend, driven, log, out) and backend.capabilities.truth:
@@ -234,14 +239,6 @@ class Demo:
         if no_truth is not None:
             raise no_truth
         return backend.watchdog.trip is None
-
-    def _start(self, fleet: Path, port: int | None, stack: ExitStack, log: Console) -> Callable[..., Svea]:
-        """Start the cars, until the stack is left; return what opens their station."""
-        what = "a router and fake cars" if self.real_time else "fake cars"
-        with compile_notice(log), Progress(log, f"starting {what}"):
-            if not self.real_time:
-                return LockstepFakes(fleet, self.seed).station
-            return partial(open_svea, fleet, connect=stack.enter_context(fakes(fleet, port, self.seed)))
 
     def _drive(self, backend: Svea, driven: list[Rows], log: Console, out: Console) -> bool:
         """Drive seed after seed, and append the figures of each; the first one is reported as a run.

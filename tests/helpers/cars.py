@@ -51,9 +51,9 @@ def open_fake(path: Path, car: str, transport: Transport, station: str | None = 
 
 
 @contextmanager
-def fakes(path: Path, station: str | None = None) -> Iterator[tuple[Hub, Mapping[str, Fake]]]:
+def fakes(path: Path) -> Iterator[tuple[Hub, Mapping[str, Fake]]]:
     """Return the cars of a deployment file on a simulated clock, which their station moves on."""
-    made = LockstepFakes(path, station=station)
+    made = LockstepFakes(path)
     yield made.hub, made.cars
 
 

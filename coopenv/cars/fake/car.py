@@ -14,7 +14,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
 from coopenv.cars.backend.binding import Binding
-from coopenv.cars.clock import CLOCK
+from coopenv.cars.clock import Clock
 from coopenv.cars.codec import decode, pose, stamp_of, warm_up
 from coopenv.cars.fake.sensors import LEADER_RATE, TRUTH_RATE, Act, CarSensors, FakeCamera, SensorPublisher
 from coopenv.cars.fake.settings import USUAL, CarFaults, FakeSettings, Wire, end_process, fake_fault, fault_topic
@@ -44,7 +44,6 @@ class Fake:
         seed: int = 0,
         differential: bool = False,
         gate: Callable[[Transport, GateClock], GateConnection] | None = None,
-        clock: GateClock = CLOCK,
         settings: FakeSettings = USUAL,
     ) -> None:
         """Put the car at the start of a seed. Its gate announces it; a moving landmark announces itself.
@@ -52,15 +51,15 @@ class Fake:
         Args:
             binding: vehicles and markers of the fleet's cars.
             name: of the car.
-            transport: the network; stays the caller's.
+            transport: the network; stays the caller's. Its wall clock is that of motion capture.
             seed: of where it starts and of its errors, which are those of the simulation with that key.
             differential: the wheels measure a turn rate, because no other sensor does.
             gate: connects a gate of its own, through which commands come; None: it obeys ManualControl on the network.
-            clock: wall and steady; the wall clock is that of motion capture.
             settings: differences from the environment.
         """
         self._settings = settings
-        self.name, self._clock, self._profile, self._faults = name, clock, binding.profile, CarFaults()
+        self._clock = clock = transport.clock
+        self.name, self._profile, self._faults = name, binding.profile, CarFaults()
         scenario, self._drives = binding.scenario, name in binding.cars
         agent = len(scenario.landmarks) + binding.cars[name] if self._drives else binding.leaders[name]
         self.world = CarWorld(scenario, agent, frames=self._profile.sees_frames)
@@ -229,11 +228,11 @@ def replay(
 ) -> Sent:
     """Return a fake's messages under commands at times in ns, up to the last one; `start` is its pose (None: any)."""
     now = commands[0][0]
-    clock = GateClock(lambda: now, lambda: now)
     arrived: list[tuple[str, bytes, int]] = []
     network: Any = SimpleNamespace(**dict.fromkeys(("subscribe", "announce", "watch", "close"), lambda *_: None))
+    network.clock = Clock(lambda: now, lambda: now)
     network.publish = lambda topic, payload, *_, **__: arrived.append((topic, payload, now))  # without other ends
-    fake = Fake(binding, car, network, seed=seed, clock=clock, settings=settings)
+    fake = Fake(binding, car, network, seed=seed, settings=settings)
     if start is not None and start.rotation is not None:
         fake.world.put(fake.world.agent, start.rotation, start.position - np.array(binding.scenario.map.origin))
     waiting = list(reversed(commands))

@@ -17,7 +17,6 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.interrupts import WITH_INPUT, before_a_hard_end, held
 from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
-from coopenv.cars.clock import CLOCK
 from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.fake.car import Fake
 from coopenv.cars.gate_process import prepare_gate
@@ -196,6 +195,6 @@ def run(fake: Fake, stop: threading.Event) -> None:
     try:
         while not stop.is_set():
             fake.advance()
-            stop.wait(max((fake.next - CLOCK.steady()) * 1e-9, REST))
+            stop.wait(max((fake.next - time.monotonic_ns()) * 1e-9, REST))
     finally:
         fake.close()

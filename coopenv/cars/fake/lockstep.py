@@ -65,21 +65,14 @@ class HubTransport(HeartbeatTransport):
 
 
 class LockstepFakes:
-    """The fake cars of a deployment, with their gates, on a simulated clock that their station moves on.
+    """The fake cars of a deployment, with their gates, on a simulated clock that their station moves on."""
 
-        cars = LockstepFakes("fleet.toml")
-        env = coopenv.parallel_env("svea_overtaking", backend=cars.station("svea_overtaking"))
-
-    Messages take no time but what `[fake]` says, and computing none. The same seeds give the same drive.
-    """
-
-    def __init__(self, path: str | Path, seed: int = 0, station: str | None = None) -> None:
+    def __init__(self, path: str | Path, seed: int = 0) -> None:
         """Build the cars.
 
         Args:
             path: deployment file; its network does not count here.
             seed: see `coopenv.cars.fake.car.Fake`.
-            station: whose commands count at the gates (None: those of the file's `security.identity`).
 
         Raises:
             CoopenvError: the file or its environment is not valid, or its cars are not fakes.
@@ -90,8 +83,7 @@ class LockstepFakes:
         """The network, and the cars by name."""
         for car in fleet.cars:
             link = self.hub.connect()
-            made = prepare_fake(path, car.name, station=station)(link, seed=seed, clock=self.clock)
-            self.cars[car.name] = made
+            made = self.cars[car.name] = prepare_fake(path, car.name)(link, seed=seed)
             self.clock.join(partial(getattr, made, "next"), made.advance)
             if fleet.profile.sees_frames and car.landmark is None:
                 camera = Calibration.of(made.world.scenario.cameras[made.world.vehicle])

@@ -97,7 +97,7 @@ class Bench:
         self.hub.connect().watch("**", lambda name, there: self.present.append(name) if there else None)
         self.hub.connect().subscribe(SVEA.topic_of("svea7", Role.MANUAL), self.wheels.append)
         for car in fleet.cars:
-            fake = prepare_fake(path, car.name, gate=False)(self.hub.connect(), clock=self.clock)
+            fake = prepare_fake(path, car.name, gate=False)(self.hub.connect())
             self.clock.join(partial(getattr, fake, "next"), fake.advance)
         assert not self.present
         for car in fleet.cars:
