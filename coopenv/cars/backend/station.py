@@ -92,8 +92,7 @@ class Pacer:
 
     def __init__(self, period: float, per_decision: int, clock: Clock = CLOCK) -> None:
         """Give the period of ticks in s, how many make a decision, and the clock."""
-        self._clock = clock
-        self._period = round(period * 1e9)
+        self._period, self._clock = round(period * 1e9), clock
         self._decision = self._period * per_decision
         self.lateness: deque[float] = deque(maxlen=KEPT)
         """Lateness (s) of the last ticks."""
@@ -188,9 +187,8 @@ class Gates:
         Unless not `probed`, arming tries from here a neutral command to the wheels: a gate that notices it stays shut.
         """
         self._transport, self._limits, self._signer, self._verifier = transport, limits, signer, verifier
-        self.profile, self._probed, self._lock = profile, probed, threading.Lock()
-        self.clock = transport.clock
-        self._states = {car: GateState(clock=self.clock) for car in cars}
+        self.profile, self.clock, self._probed, self._lock = profile, transport.clock, probed, threading.Lock()
+        self._states = {car: GateState(clock=transport.clock) for car in cars}
         self._before: dict[str, Counter[str]] = {}
         self._cars = {self.profile.topic_of(car, Role.GATE): car for car in cars}
         self._stopping = False
