@@ -91,7 +91,7 @@ class Fake:
             car_clock = GateClock(lambda: clock.wall() + self._faults.clock_error(clock.steady()), clock.steady)
             self._link = gate(self._wire, car_clock)
             acts.append((1e9 / PERIOD, self._tick_gate))
-        elif self._drives:  # no presence: the gate's would not go with the gate
+        elif self._drives:  # presence is the gate's, and ends with it
             transport.subscribe(self._profile.topic_of(name, Role.MANUAL), self._later(self.obey))  # on the car
         else:
             transport.announce(presence_of(name))
