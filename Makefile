@@ -39,7 +39,7 @@ $(VENV)/.svea: $(VENV)/.base
 	@$(PIP) --editable '.[svea]'
 	@touch $@
 
-svea-demo: $(VENV)/.svea ## two fake cars overtake in real time; table here, figures in out/svea_overtaking, half a minute
+svea-demo: $(VENV)/.svea ## two fake cars overtake; table here, figures in out/svea_overtaking, half a minute
 	@$(BIN)/coopenv svea demo --out out/svea_overtaking
 
 # Three workers on two cores: tests of cars wait for their clock most of the time.

@@ -65,6 +65,7 @@ class Capabilities:
     batched: bool  # it makes worlds on a device itself (`WorldBackend`)
     recorded: bool = False  # its ticks are always the same ones: neither seeds nor commands change anything
     estimated: tuple[int, ...] | None = None  # vehicles that are estimated here and are agents (None: all)
+    simulated_clock: bool = False  # that clock waits for the caller: no load makes a decision late
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ is a car that stands. Its `false` does nothing.
 import math
 import secrets
 import struct
+import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -182,8 +183,8 @@ class Rejected(Exception):  # noqa: N818
 class GateClock:
     """Clocks of the gate."""
 
-    wall: Callable[[], int]  # ns, that of stamps
-    steady: Callable[[], int]  # ns, never set
+    wall: Callable[[], int] = time.time_ns  # ns, that of stamps
+    steady: Callable[[], int] = time.monotonic_ns  # ns, never set
 
 
 PERIOD = 50_000_000  # ns between outputs

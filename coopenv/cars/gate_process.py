@@ -19,7 +19,6 @@ from coopenv.cars.keys import Signer, check_identity, load_keys
 from coopenv.cars.profile import NEUTRAL, Role, presence_of
 from coopenv.cars.transport import SECURE, Arrival, Transport, address_of
 
-CLOCK = GateClock(time.time_ns, time.monotonic_ns)
 TICKS_PER_STATUS = 4  # 5 Hz
 LAST_NEUTRALS = 5  # that the car gets before the gate goes
 MOST_SENT = 1200  # own commands that may be under way: a minute

@@ -120,7 +120,7 @@ class Authors:
 
     def __init__(self, wire: Transport, routes: Iterable[TopicRoute]) -> None:
         """Take a network with the authors' messages, which is closed with this, and the translated topics."""
-        self._wire = wire
+        self._wire, self.clock = wire, wire.clock
         self.announce, self.watch, self.close = wire.announce, wire.watch, wire.close
         self._routes = {route.topic: route for route in routes}
         self._names = {route.name for route in self._routes.values()}
@@ -318,9 +318,7 @@ class Ros1(HeartbeatTransport):
                 return found
             made = self._rospy.Publisher(f"/{topic}", self._kind(topic), queue_size=MOST_WAITING)
             self._publishers[topic] = made
-        give_up = time.monotonic() + (PATIENCE if patient else 0.0)
-        while time.monotonic() < give_up and not made.get_num_connections():
-            time.sleep(0.01)
+        self.clock.wait(made.get_num_connections, PATIENCE if patient else 0.0)
         return made
 
     def subscribe(self, pattern: str, callback: Callback) -> None:

@@ -22,6 +22,7 @@ from pydantic import model_validator
 
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.base.sections import Section
+from coopenv.cars.clock import CLOCK, Clock
 
 
 class LinkError(CoopenvError):
@@ -50,6 +51,9 @@ Change = Callable[[str, bool], None]
 
 class Transport(Protocol):
     """A connection to the network; used from any thread."""
+
+    clock: Clock
+    """Of this end, for times of reception and ages."""
 
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
@@ -80,6 +84,7 @@ class ReceivingTransport:
     def __init__(self, transport: Transport) -> None:
         """Wrap a transport."""
         self.subscribe, self.watch, self.close = transport.subscribe, transport.watch, transport.close
+        self.clock = transport.clock
 
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
@@ -107,6 +112,7 @@ class HeartbeatTransport(ABC):
     """A transport on a network without presence: its ends send heartbeats of the names that they announce."""
 
     def __init__(self) -> None:
+        self.clock = CLOCK
         self._self = uuid.uuid4().bytes  # two ends may announce one name, of which one goes
         self._own: list[str] = []
         self._last: dict[tuple[str, bytes], float] = {}

@@ -13,6 +13,7 @@ from weakref import WeakSet
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, needing
+from coopenv.cars.clock import CLOCK
 from coopenv.cars.deployment import Deployment, DeploymentError
 from coopenv.cars.transport import (
     SECURE,
@@ -35,7 +36,7 @@ class Zenoh:
     """A Zenoh session as a transport."""
 
     def __init__(self, session: Any, module: Any) -> None:
-        self.session, self.library = session, module
+        self.session, self.library, self.clock = session, module, CLOCK
         self._kept: list[Any] = []  # a declaration ends with its last reference
         _sessions().add(self)
 

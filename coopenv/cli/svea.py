@@ -37,7 +37,7 @@ def demo(
         Path | None, typer.Option(help="Or a deployment file of your own, whose cars are fakes (fakes = true).")
     ] = None,
     port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Port of the router on this computer (default: a free one).")
+        int | None, typer.Option(min=1, max=65535, help="Port of the router of --real-time (default: a free one).")
     ] = None,
     out: Annotated[
         Path | None,
@@ -51,13 +51,14 @@ def demo(
     beside: Annotated[
         bool, typer.Option("--beside", help="Simulate the same seeds, too, and print both side by side.")
     ] = False,
+    real_time: Annotated[bool, typer.Option("--real-time", help="Run a process per car, and a router.")] = False,
     overrides: options.Overrides = None,
 ) -> None:
-    """Let fake cars drive an experiment in real time: table, figures, and a drive that can be run again.
+    """Let fake cars drive an experiment: table, figures, and a drive that can be run again.
 
-    A router and a process per car run on this computer's loopback for as long as it takes, half a minute. The first
-    time kernels are compiled, which takes a minute or two more. The exit status is 3 where the watchdog stopped the
-    cars.
+    Cars, gates and station run in lockstep on a simulated clock, so that a busy computer takes longer and stops no car.
+    The first time kernels are compiled, which takes a minute or two. The exit status is 3 where the watchdog stopped
+    the cars.
     """
     from coopenv.runs.demo import Demo
 
@@ -65,7 +66,7 @@ def demo(
         raise CoopenvError(f"--environment: {fleet} names one; give --environment or --fleet")
     name = (environment or "svea_overtaking") if fleet is None else fleet.stem
     folder = out or Path("out") / name
-    chosen = Demo(name, folder, policy, seed, options.parse_overrides(overrides), seconds, beside, fleet)
+    chosen = Demo(name, folder, policy, seed, options.parse_overrides(overrides), seconds, beside, fleet, real_time)
     if not chosen.run(port, options.console(stderr=True), options.console()):
         raise typer.Exit(STOPPED)
 
@@ -143,7 +144,8 @@ def gate(
     Limits beyond those of the make are refused: for SVEA 1.53 m/s, 0.5236 rad, 2 m/s^2 and 4 rad/s.
     """
     from coopenv.base import interrupts
-    from coopenv.cars.gate_process import CLOCK, gate_deployment, prepare_gate, run
+    from coopenv.cars.clock import CLOCK
+    from coopenv.cars.gate_process import gate_deployment, prepare_gate, run
     from coopenv.cars.zenoh import open_transport
 
     bounds = {"speed": max_speed, "steering": max_steering, "acceleration": max_acceleration}
@@ -173,8 +175,9 @@ def health(
         float | None,
         typer.Option(min=0.0, help="s of messages for offset and drift of its clocks (default: 5 with --off-board)."),
     ] = None,
+    read_only: Annotated[bool, typer.Option("--read-only", help="Send nothing, as a health check.")] = False,
 ) -> None:
-    """Print the next status of a car's gate, and try from outside a neutral command to the wheels.
+    """Print the next status of a car's gate, and unless --read-only try from outside a neutral command to the wheels.
 
     The exit status is 2 where no status comes, or where the command gets through: the gate notices it and stops the
     car. On the car it connects to where the gate does, and tries from the deployment's network.connect. From elsewhere:
@@ -212,6 +215,8 @@ def health(
 
             for name, clock in measured_clocks(transport, fleet, car, seconds).items():
                 print(f"{car}: clock of {name}: {clock}")
+        if read_only:
+            return
         if fleet.network.kind != "zenoh":
             print(f"{car}: network.kind = {fleet.network.kind} {UNTRIED}")
             return

@@ -77,6 +77,7 @@ def execute(
         log.print("note: all motion here is prescribed, the policy has no effect", soft_wrap=True)
     steady = steady_start(steady_from, scenario.horizon, run.ticks_planned / scenario.rates.camera)
     able = run.engine.backend.capabilities
+    paced = scenario.rates.camera if able.real_time and not able.simulated_clock else None
     doing = "replaying" if able.recorded else "driving" if able.real_time else "simulating"
     with nullcontext() if out is None else replacing_folder(out, result_names()) as folder:
         with compile_notice(log):
@@ -84,7 +85,7 @@ def execute(
         keeper = Keeper(run.engine, source_of(run.engine, name, run.seed, run.policy_name))
         record = None if able.recorded or able.real_time or out is None else RunRecord(run)
         with (
-            Progress(log, doing, run.ticks_planned, scenario.rates.camera if able.real_time else None) as progress,
+            Progress(log, doing, run.ticks_planned, paced) as progress,
             _kept_if_failed(record, out, name, log),
         ):
             for tick in run.play():
@@ -215,6 +216,8 @@ def report(run: Rollout, result: "Results", folder: Path, out: Console) -> None:
     done = f"Simulated at {metrics['real_time_factor']:.3g} times real time"
     if able.recorded:
         source, done = "recorded", done.replace("Simulated", "Replayed")
+    elif able.simulated_clock:
+        source, done = f"on a simulated clock, seed {run.seed}", done.replace("Simulated", "Driven")
     elif able.real_time:
         source, done = f"in real time, seed {run.seed}", f"It took {metrics['simulated_time_s']:.4g} s of real time"
     out.print(f"{run.scenario.title}: {source}, {metrics['dtype']} on {metrics['device']}", soft_wrap=True)

@@ -1,6 +1,6 @@
-"""`coopenv svea demo`: an experiment of the laboratory with fake cars, from the first process to the figures."""
+"""`coopenv svea demo`: an experiment of the laboratory with fake cars, from their start to the figures."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
@@ -20,6 +20,7 @@ from coopenv.base.installation import data_directory
 from coopenv.base.interrupts import also_kept
 from coopenv.cars.backend.backend import Svea, open_svea
 from coopenv.cars.fake.fleet import fakes
+from coopenv.cars.fake.lockstep import LockstepFakes
 from coopenv.cars.profile import Role
 from coopenv.cars.zenoh import library
 from coopenv.estimation.metrics import live_ticks, summarise
@@ -158,6 +159,8 @@ class Demo:
     """Simulate the same seeds, too, and show them beside."""
     deployment: Path | None = None
     """One's own deployment file, whose cars are fakes; `environment` is its environment then."""
+    real_time: bool = False
+    """Run a router and a process per car in real time, and not all in this one on a simulated clock."""
     time: float = field(default=0.0, init=False)
     """Driven time, s."""
     decisions: int = field(default=0, init=False)
@@ -179,7 +182,7 @@ class Demo:
         Of a drive that is interrupted what has been driven takes its place, unless an earlier drive stands there.
 
         Args:
-            port: of the router (None: a free one).
+            port: of the router in real time (None: a free one).
             log: progress.
             out: results.
 
@@ -187,6 +190,8 @@ class Demo:
             CoopenvError: the extra is missing, a process does not start, the cars cannot be armed, results cannot be
                 written, or no true poses are known; the drive is kept in the last case.
         """
+        if port is not None and not self.real_time:
+            raise CoopenvError("--port: cars on a simulated clock have no router; give --real-time, too")
         library()
         fleet, drive = self.fleet, self.out.with_name(f"{self.out.name}.mcap")
         driven: list[Rows] = []
@@ -194,11 +199,15 @@ class Demo:
         with writing(drive.parent):
             drive.parent.mkdir(parents=True, exist_ok=True)
         with ExitStack() as stack:
-            with compile_notice(log), Progress(log, "starting a router and fake cars"):
-                router = stack.enter_context(fakes(fleet, port, self.seed))
+            with compile_notice(log), Progress(log, "starting fake cars"):
+                station: Callable[..., Svea]
+                if self.real_time:
+                    station = partial(open_svea, fleet, connect=stack.enter_context(fakes(fleet, port, self.seed)))
+                else:
+                    station = LockstepFakes(fleet, self.seed).station
             record = stack.enter_context(replacing_file(drive))
             environment = None if self.deployment else self.environment
-            backend = open_svea(fleet, environment, self.overrides, record=record, connect=router)
+            backend = station(environment, overrides=self.overrides, record=record)
             stack.callback(backend.close)
             try:
                 if not self._drive(backend, driven, log, out) and backend.capabilities.truth:

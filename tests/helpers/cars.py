@@ -1,4 +1,4 @@
-"""Fake cars in threads of this process, on a network within it: all that is real but the sockets."""
+"""Fake cars in this process, on a network within it: all that is real but the sockets, and mostly the time."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from coopenv.cars.codec import encode, make
 from coopenv.cars.deployment import load_deployment
 from coopenv.cars.fake.car import Fake, fault_topic
 from coopenv.cars.fake.fleet import prepare_fake, run
+from coopenv.cars.fake.lockstep import Hub, LockstepFakes
 from coopenv.cars.transport import Transport
-from tests.helpers.hub import Hub
 
 PATIENT = """
 [safety] # a machine that runs many tests at once is slow
@@ -22,6 +22,8 @@ odometry_age = 2.0
 missed_deadlines = 60
 max_clock_offset = 0.5
 """
+
+SAFETY = "\n[safety]\n"
 
 LAB = 'environment = "svea_overtaking"\nmarkers = { SL1 = 1, SL2 = 2, SL4 = 4, SL5 = 5 }\n'
 LAB_CARS = """
@@ -36,7 +38,7 @@ marker = 6
 OVERTAKING = f"{LAB}fakes = true\n{LAB_CARS}"
 
 
-def write_fleet(folder: Path, text: str = OVERTAKING, safety: str = PATIENT) -> Path:
+def write_fleet(folder: Path, text: str = OVERTAKING, safety: str = SAFETY) -> Path:
     """Write a deployment file and return its path."""
     path = folder / "fleet.toml"
     path.write_text(text + safety)
@@ -49,18 +51,23 @@ def open_fake(path: Path, car: str, transport: Transport, station: str | None = 
 
 
 @contextmanager
-def fakes(path: Path, **options: Any) -> Iterator[tuple[Hub, Mapping[str, Fake]]]:
-    """Let the cars of a deployment file live until the block ends."""
+def fakes(path: Path) -> Iterator[tuple[Hub, Mapping[str, Fake]]]:
+    """Return the cars of a deployment file on a simulated clock, which their station moves on."""
+    made = LockstepFakes(path)
+    yield made.hub, made.cars
+
+
+@contextmanager
+def threaded_fakes(path: Path) -> Iterator[Hub]:
+    """Let the cars of a deployment file live in real time until the block ends."""
     deployment, hub, over = load_deployment(path), Hub(), threading.Event()
     links = [hub.connect() for _ in deployment.cars]
-    made = {
-        car.name: open_fake(path, car.name, link, **options) for car, link in zip(deployment.cars, links, strict=True)
-    }
-    threads = [threading.Thread(target=run, args=(fake, over), daemon=True) for fake in made.values()]
+    made = [open_fake(path, car.name, link) for car, link in zip(deployment.cars, links, strict=True)]
+    threads = [threading.Thread(target=run, args=(fake, over), daemon=True) for fake in made]
     for thread in threads:
         thread.start()
     try:
-        yield hub, made
+        yield hub
     finally:
         over.set()
         for thread in threads:
@@ -70,7 +77,7 @@ def fakes(path: Path, **options: Any) -> Iterator[tuple[Hub, Mapping[str, Fake]]
 
 
 def cars(path: Path, hub: Hub, **options: Any) -> Svea:
-    """Return the cars as a backend."""
+    """Return the cars as a backend, on the clock of their network."""
     return open_svea(path, transport=hub.connect(), **options)
 
 

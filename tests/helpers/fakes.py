@@ -11,14 +11,15 @@ import numpy as np
 
 from coopenv.cars.backend.backend import Svea
 from coopenv.cars.backend.binding import bind
+from coopenv.cars.clock import Clock
 from coopenv.cars.codec import decode, encode, make
 from coopenv.cars.deployment import Car, Deployment, Sensors
 from coopenv.cars.fake.car import Fake, fault_topic
-from coopenv.cars.gate import GateClock, write_drive
+from coopenv.cars.fake.lockstep import Hub
+from coopenv.cars.gate import write_drive
 from coopenv.cars.profile import RESET_TOPIC, SVEA, CarProfile, MotionCommand, Role
 from coopenv.cars.transport import Arrival
 from coopenv.scenario import Scenario, load_scenario
-from tests.helpers.hub import Hub
 
 MARKERS = {"SL1": 1, "SL2": 2, "SL4": 4, "SL5": 5}
 OVERTAKING = (Car(name="svea7", marker=7), Car(name="svea8", marker=6))
@@ -54,14 +55,13 @@ class Stage:
         self.fleet = Deployment(
             environment=environment, cars=cars, markers=MARKERS, fakes=True, sensors=sensors, profile=profile
         )
-        self.hub, self._said = Hub(), defaultdict[str, list[Arrival]](list)
+        self.hub = Hub(Clock(lambda: self.wall + self.now, lambda: self.now))
+        self._said = defaultdict[str, list[Arrival]](list)
         self.network = self.hub.connect()
         self.network.subscribe("**", lambda arrival: self._said[arrival.topic].append(arrival))
         self.binding = binding = bind(self.scenario, cars, MARKERS, "test", None, profile)
-        clock = GateClock(lambda: self.wall + self.now, lambda: self.now)
         self.cars = {
-            car.name: Fake(binding, car.name, self.hub.connect(), differential=wheel, clock=clock, **options)
-            for car in cars
+            car.name: Fake(binding, car.name, self.hub.connect(), differential=wheel, **options) for car in cars
         }
 
     def run(self, seconds: float) -> None:

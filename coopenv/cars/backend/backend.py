@@ -2,9 +2,8 @@
 
 import gc
 import threading
-import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,17 +66,18 @@ class Svea:
         Args:
             deployment: the fleet.
             binding: vehicles and markers of its cars.
-            transport: the network; closed with the backend.
+            transport: the network, by whose clock ticks are due; closed with the backend.
             signer: signs sent messages (None: they are not signed).
             verifier: knows the cars' keys (None: signatures do not count).
             recorder: records the messages of the ticks, and the reasons of stops.
         """
         self.deployment, self.binding, self.scenario = deployment, binding, binding.scenario
-        self._transport, self.recorder = transport, recorder
+        self._transport, self.recorder, self._clock = transport, recorder, transport.clock
         self.capabilities = Capabilities(
             truth=deployment.sensors.truth,
             driven=True,
             real_time=True,
+            simulated_clock=transport.clock.simulated,
             ticks=None,
             batched=False,
             estimated=None if not binding.remote else binding.local,
@@ -85,7 +85,7 @@ class Svea:
         self.health = Health()
         self.refused: dict[str, int] = {}
         """Samples that were not used, by reason."""
-        self.pacer = Pacer(1.0 / self.scenario.rates.camera, self.scenario.ticks_per_decision)
+        self.pacer = Pacer(1.0 / self.scenario.rates.camera, self.scenario.ticks_per_decision, self._clock)
         self._origin = np.array(self.scenario.map.origin)
         landmarks = self.scenario.landmarks
         self._landmarks = np.array([mark.position for mark in landmarks]).reshape(-1, 3) - self._origin
@@ -131,7 +131,7 @@ class Svea:
         if self.deployment.fakes:
             signed = ((seed or 0) + 2**63) % 2**64 - 2**63  # the same 64 bits
             self._transport.publish(RESET_TOPIC, encode(make("std_msgs/msg/Int64", data=signed)), reliable=True)
-            time.sleep(SETTLE)  # they go to the start of the seed
+            self._clock.sleep(SETTLE)  # they go to the start of the seed
         self.monitor.begin(self.pacer.now())
         self._listen(arm)
         self.station.dropped.clear()
@@ -148,9 +148,9 @@ class Svea:
         """Wait a limited time for messages of the cars: only driving needs them."""
         topics = [self.binding.profile.topic_of(name, role) for name in self._local for role in self._odometry]
         patience = 0.0 if self._received_once else FIRST_MESSAGES_TIME
-        _wait(lambda: all(self.station.silence(topic) < 1.0 for topic in topics), patience)
+        self._clock.wait(lambda: all(self.station.silence(topic) < 1.0 for topic in topics), patience)
         if arm:
-            _wait(lambda: self.board.calibrations.keys() >= self._local.keys(), CAMERA_INFO_TIME)
+            self._clock.wait(lambda: self.board.calibrations.keys() >= self._local.keys(), CAMERA_INFO_TIME)
         self._received_once = True
         self.drain()
 
@@ -160,7 +160,7 @@ class Svea:
         Raises:
             CoopenvError: a condition of arming does not hold.
         """
-        _wait(lambda: self._obstacle() is None, READY_TIME)
+        self._clock.wait(lambda: self._obstacle() is None, READY_TIME)
         if found := self._obstacle():
             raise CoopenvError(f"not armed: {found}")
         if (kind := self.deployment.network.kind) != "zenoh":
@@ -301,13 +301,6 @@ class Svea:
         finally:
             self._transport.close()
             gc.unfreeze()
-
-
-def _wait(ready: Callable[[], bool], patience: float) -> None:
-    """Wait for something to become true, s at most."""
-    until = time.monotonic() + patience
-    while time.monotonic() < until and not ready():
-        time.sleep(0.02)
 
 
 def open_svea(

@@ -5,7 +5,6 @@ is not armed, or is stopped.
 """
 
 import threading
-import time
 from bisect import bisect_right
 from collections import Counter, deque
 from collections.abc import Iterator
@@ -186,7 +185,7 @@ class Condition(NamedTuple):
 
     status: CarStatus = CarStatus()
     stamp: int = -1  # ns, clock of the car
-    since: float = float("-inf")  # s, monotonic: when the condition held
+    since: float = float("-inf")  # s, steady: when the condition held
 
 
 class StatusBoard:
@@ -204,7 +203,7 @@ class StatusBoard:
             needed: True if cars must send the conditions of their profile.
             profile: make of the cars.
         """
-        self._lock = threading.Lock()
+        self._lock, self._clock = threading.Lock(), transport.clock
         self._remote, self._needed, self._profile = remote, needed, profile
         self._conditions_needed = tuple(map(Role, profile.conditions)) if needed else ()
         self._topics = {profile.topic_of(car, role): (car, role) for car in cars for role in ROLES}
@@ -270,7 +269,7 @@ class StatusBoard:
                 return
             new = stamp > self._conditions[key].stamp and abs(delay) <= (topic.max_age or 0.0)
             if isinstance(value, CarStatus) and new:
-                self._conditions[key] = Condition(value, stamp, time.monotonic() - max(delay, 0.0))
+                self._conditions[key] = Condition(value, stamp, self._clock.seconds() - max(delay, 0.0))
                 if key in self._begun and (why := self._changed(role, self._begun[key].status, value)):
                     self._happened.setdefault(car, why)
 
@@ -294,7 +293,7 @@ class StatusBoard:
         return ""
 
     def _silent(self, car: str, role: Role) -> str:
-        age = time.monotonic() - self._conditions[car, role].since
+        age = self._clock.seconds() - self._conditions[car, role].since
         if age <= (self._profile.topics[role].max_age or 0.0):
             return ""
         words = "was received" if age == float("inf") else f"for {age:.2f} s"

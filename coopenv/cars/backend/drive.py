@@ -270,7 +270,7 @@ class RecordedTransport:
             recorder: records all messages that are sent, and presence.
             aside: topics of which no ticks are made: what comes on them is written at once.
         """
-        self._transport, self._recorder = transport, recorder
+        self._transport, self._recorder, self.clock = transport, recorder, transport.clock
         self.subscribe, self.announce, self.watch = transport.subscribe, transport.announce, transport.watch
         self.close = transport.close
         for topic in aside:
@@ -282,11 +282,11 @@ class RecordedTransport:
     ) -> None:
         """Send, see `Transport`, and record the message."""
         self._transport.publish(topic, payload, attachment, urgent=urgent, reliable=reliable)
-        self._recorder.write(topic, payload, time.time_ns())
+        self._recorder.write(topic, payload, self.clock.wall())
 
     def _write_aside(self, arrival: Arrival) -> None:
         if not refusal(arrival):
             self._recorder.write(arrival.topic, arrival.payload, arrival.received)
 
     def _write_presence(self, name: str, there: bool) -> None:
-        self._recorder.write(name, encode(make(PRESENCE, data=there)), time.time_ns())
+        self._recorder.write(name, encode(make(PRESENCE, data=there)), self.clock.wall())

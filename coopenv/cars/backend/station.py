@@ -2,12 +2,12 @@
 
 import secrets
 import threading
-import time
 from collections import Counter, deque
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from coopenv.base.errors import CoopenvError
+from coopenv.cars.clock import CLOCK, Clock
 from coopenv.cars.gate import ARM, BOOL, COMMAND, STATUS, GateMode, Malformed, Reason, read, write, write_drive
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.profile import NEUTRAL, SVEA, CarProfile, Limits, Role
@@ -44,7 +44,7 @@ class Station:
             verifier: checks signatures; None: nothing is signed.
             signers: identities that may sign a topic, for topics that could be forged.
         """
-        self._lock = threading.Lock()
+        self._lock, self._clock = threading.Lock(), transport.clock
         self._waiting: dict[str, deque[Arrival]] = {topic: deque(maxlen=MOST_WAITING) for topic in topics}
         self._last: dict[str, float] = {}
         self._verifier, self._signers = verifier, signers
@@ -63,7 +63,7 @@ class Station:
             if len(waiting) == MOST_WAITING:
                 self.dropped["overflow"] += 1
             waiting.append(arrival)
-            self._last[arrival.topic] = time.monotonic()
+            self._last[arrival.topic] = self._clock.seconds()
 
     def drain(self) -> list[Arrival]:
         """Return the messages since the last call, in the order of reception."""
@@ -76,7 +76,7 @@ class Station:
     def silence(self, topic: str) -> float:
         """Return for how long nothing has come on a topic, s; inf: never anything."""
         with self._lock:
-            return time.monotonic() - self._last.get(topic, float("-inf"))
+            return self._clock.seconds() - self._last.get(topic, float("-inf"))
 
 
 KEPT = 100_000  # lateness of so many ticks is kept for the statistics
@@ -90,9 +90,9 @@ class Pacer:
     left out, and the next decisions follow at whole decisions after it.
     """
 
-    def __init__(self, period: float, per_decision: int) -> None:
-        """Give the period of ticks in s, and how many make a decision."""
-        self._period = round(period * 1e9)
+    def __init__(self, period: float, per_decision: int, clock: Clock = CLOCK) -> None:
+        """Give the period of ticks in s, how many make a decision, and the clock."""
+        self._period, self._clock = round(period * 1e9), clock
         self._decision = self._period * per_decision
         self.lateness: deque[float] = deque(maxlen=KEPT)
         """Lateness (s) of the last ticks."""
@@ -100,11 +100,11 @@ class Pacer:
 
     def now(self) -> int:
         """Return the time."""
-        return time.monotonic_ns() + self._wall
+        return self._clock.steady() + self._wall
 
     def start(self) -> int:
         """Begin anew: time counts from the first decision on. Returns the time now."""
-        self._wall = time.time_ns() - time.monotonic_ns()
+        self._wall = self._clock.wall() - self._clock.steady()
         self._due, self._late = 0, False  # before the first decision
         self.missed = self.in_a_row = 0
         """Decisions that missed their deadline, in all and in a row up to now."""
@@ -123,7 +123,7 @@ class Pacer:
         self._due += self._period
         left = self._due - self.now()
         if left > 0:
-            time.sleep(left * 1e-9)
+            self._clock.sleep(left * 1e-9)
         now = self.now()
         self.lateness.append((now - self._due) * 1e-9)
         return now
@@ -142,10 +142,10 @@ class Pacer:
 
 
 PATIENCE = 1.0  # s for a gate to answer
+RETRY = 0.05  # s between armings
 STATUS_TIME = 0.5  # s for a new status of every gate
 LATE, AHEAD = 500_000_000, 50_000_000  # ns by which a status may be old, or ahead of this clock
 OLD = 1.0  # s without a status after which a gate counts as gone
-POLL = 0.01  # s
 OPEN = ("armed", "timed_out")
 """States of a gate that takes commands: after a time-out the car stands until the next one."""
 
@@ -160,12 +160,13 @@ class GateState:
     stamp: int = 0  # ns, by the clock of the car
     rejections: Counter[str] = field(default_factory=Counter)
     accepted: int = 0  # commands, since its start
-    received: float = float("-inf")  # by the monotonic clock, s
+    received: float = float("-inf")  # by the steady clock, s
+    clock: Clock = CLOCK
 
     @property
     def age(self) -> float:
         """Age of the status, s."""
-        return time.monotonic() - self.received
+        return self.clock.seconds() - self.received
 
 
 class Gates:
@@ -186,8 +187,8 @@ class Gates:
         Unless not `probed`, arming tries from here a neutral command to the wheels: a gate that notices it stays shut.
         """
         self._transport, self._limits, self._signer, self._verifier = transport, limits, signer, verifier
-        self.profile, self._probed, self._lock = profile, probed, threading.Lock()
-        self._states = {car: GateState() for car in cars}
+        self.profile, self.clock, self._probed, self._lock = profile, transport.clock, probed, threading.Lock()
+        self._states = {car: GateState(clock=transport.clock) for car in cars}
         self._before: dict[str, Counter[str]] = {}
         self._cars = {self.profile.topic_of(car, Role.GATE): car for car in cars}
         self._stopping = False
@@ -236,7 +237,7 @@ class Gates:
                 self.dropped[car]["out of order"] += 1
                 return
             known = mode, session, nonce, stamp, counts, accepted
-            self._states[car] = GateState(*known, time.monotonic())
+            self._states[car] = GateState(*known, self.clock.seconds(), self.clock)
             if mode is GateMode.STOPPED and not self._stopping:
                 self.stopped_by_others.add(car)
             self._before.setdefault(car, counts)
@@ -256,7 +257,7 @@ class Gates:
                 f"not armed: {stopped[0]}: it was stopped elsewhere; once you know why, release it "
                 '(`coopenv svea run --release`, options={"arm": True, "release": True})'
             )
-        until = time.monotonic() + PATIENCE
+        until = self.clock.seconds() + PATIENCE
         while closed := [c for c, s in self.states.items() if (s.state, s.session) != ("armed", self.session)]:
             states = self.states
             for car in closed:
@@ -266,14 +267,14 @@ class Gates:
                     if states[car].rejections[Reason.FOREIGN] > before[car].rejections[Reason.FOREIGN]:
                         raise CoopenvError(f"not armed: {car}: {BYPASSED}")
                     raise CoopenvError(f"{car}: was stopped while it was being armed")
-            if time.monotonic() > until:
+            if self.clock.seconds() > until:
                 self.end()
                 raise CoopenvError(f"{closed[0]}: {_why_closed(before[closed[0]], states[closed[0]])}")
             for car in closed:
                 if self._probed:  # like the arming, so that it comes before it
-                    self._transport.publish(*neutral_command(self.profile, car), reliable=True)
+                    self._transport.publish(*neutral_command(self.profile, car, self.clock), reliable=True)
                 self._arm(car, True, states[car].nonce)  # of that status: a later stop invalidates it
-            time.sleep(5 * POLL)
+            self.clock.sleep(RETRY)
         with self._lock:
             self._stopping = False
             self.stopped_by_others.clear()
@@ -281,9 +282,8 @@ class Gates:
 
     def fresh_states(self, patience: float = STATUS_TIME) -> dict[str, GateState]:
         """Return a status of each gate, waiting `patience` s for new ones. Raises CoopenvError: a gate is silent."""
-        asked, known = time.monotonic(), {car: counts.copy() for car, counts in self.dropped.items()}
-        while any(state.received < asked for state in self.states.values()) and time.monotonic() < asked + patience:
-            time.sleep(POLL)
+        asked, known = self.clock.seconds(), {car: counts.copy() for car, counts in self.dropped.items()}
+        self.clock.wait(lambda: all(state.received >= asked for state in self.states.values()), patience)
         for car, state in self.states.items():
             if state.age <= OLD:
                 continue
@@ -301,7 +301,7 @@ class Gates:
         self.session = ""
 
     def _arm(self, car: str, armed: bool, nonce: str) -> None:
-        self.send(car, Role.ARM, write(ARM, time.time_ns(), "", self.session, nonce, armed))
+        self.send(car, Role.ARM, write(ARM, self.clock.wall(), "", self.session, nonce, armed))
 
     def stop(self) -> None:
         """Stop every gate at once, until the next arming."""
@@ -317,7 +317,7 @@ class Gates:
         steering = min(max(steering, -limits.steering), limits.steering)
         numbers = steering, limits.steering_rate, speed, min(acceleration, limits.acceleration), 0.0
         frame = f"{self.session}:{self._sequence}"
-        self.send(car, Role.COMMAND, write(COMMAND, time.time_ns(), frame, *numbers))
+        self.send(car, Role.COMMAND, write(COMMAND, self.clock.wall(), frame, *numbers))
 
     def next(self) -> None:
         """Begin the commands of the next decision."""
@@ -341,9 +341,9 @@ UNTRIED = "has no access rules: past the gate, any of its programs can command t
 """Warning for networks other than Zenoh."""
 
 
-def neutral_command(profile: CarProfile, car: str) -> tuple[str, bytes]:
+def neutral_command(profile: CarProfile, car: str, clock: Clock = CLOCK) -> tuple[str, bytes]:
     """Return topic and bytes of a command to the wheels of a car to stand, such as its gate alone may send."""
-    return profile.topic_of(car, Role.MANUAL), write_drive(time.time_ns(), profile.command, NEUTRAL)
+    return profile.topic_of(car, Role.MANUAL), write_drive(clock.wall(), profile.command, NEUTRAL)
 
 
 def _why_closed(before: GateState, now: GateState) -> str:

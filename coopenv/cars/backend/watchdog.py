@@ -1,10 +1,10 @@
-"""The watchdog: a thread of its own that stops the cars whatever the driving program does."""
+"""The watchdog: it looks by itself and stops the cars whatever the driving program does."""
 
 import math
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal
@@ -180,7 +180,7 @@ class Trip:
 
     reason: str
     car: str = ""  # that caused it; empty: no single car
-    time: float = 0.0  # monotonic, s
+    time: float = 0.0  # steady, s
 
 
 class Watchdog:
@@ -217,13 +217,13 @@ class Watchdog:
         self._cars, self._others, self._odometry, self._decision = cars, others, odometry, decision
         self._happened, self._stopped = happened, stopped
         self._lock = threading.Lock()
-        self._armed, self._closed = False, threading.Event()
+        self._armed, self._clock = False, gates.clock
         self.trip: Trip | None = None
         self._beat: float | None = None  # of the last decision; None: there has been none
         self._missed = 0
         self._present = dict.fromkeys(map(presence_of, cars), True)
-        self._thread = threading.Thread(target=self._watch, name="coopenv watchdog", daemon=True)
-        self._thread.start()
+        self._repeated, self._looked, self._stalled = 0.0, self._clock.seconds(), False
+        self._closed, self._end = False, self._clock.repeat(PERIOD, self._look, "coopenv watchdog")
 
     def forget(self) -> None:
         """Clear the last stop, so that cars can be armed."""
@@ -231,8 +231,8 @@ class Watchdog:
             self.trip = None
 
     def arm(self) -> None:
-        """Watch the cars from now on. Raises CoopenvError: the watchdog's thread has ended."""
-        if not self._thread.is_alive():
+        """Watch the cars from now on. Raises CoopenvError: the watchdog has ended."""
+        if self._closed:
             raise CoopenvError("not armed: the watchdog has ended")
         with self._lock:
             self._armed, self._beat, self._missed = True, None, 0
@@ -244,7 +244,7 @@ class Watchdog:
 
     def beat(self, missed: int) -> None:
         """Note a decision, after `missed` late ones in a row."""
-        self._beat, self._missed = time.monotonic(), missed
+        self._beat, self._missed = self._clock.seconds(), missed
 
     def set_present(self, token: str, there: bool) -> None:
         """Note that a token of presence has appeared or disappeared; tokens of other ends do not count."""
@@ -257,7 +257,7 @@ class Watchdog:
             if not self._armed:
                 return
             self._armed = False
-            self.trip = trip = Trip(reason, car, time.monotonic())
+            self.trip = trip = Trip(reason, car, self._clock.seconds())
         try:
             self._gates.stop()
             self._stopped(trip)
@@ -265,31 +265,27 @@ class Watchdog:
             self._gates.end()
 
     def close(self) -> None:
-        """End the thread."""
-        self._closed.set()
-        self._thread.join(timeout=1.0)
+        """Look no more."""
+        self._closed = True
+        self._end()
 
-    def _watch(self) -> None:
-        repeated, looked, stalled = 0.0, time.monotonic(), False
-        while not self._closed.wait(PERIOD):
-            before, looked = looked, time.monotonic()
-            stalled = not stalled and looked - before > PERIOD + STALL
-            if stalled:  # once: the next look follows at once
-                continue
-            try:
-                if self._armed:
-                    try:
-                        found = next(self._problems(), None)
-                    except Exception as error:  # a watchdog that fails has to stop the cars
-                        found = "", f"the watchdog failed: {type(error).__name__}: {error}"
-                    if found is not None:
-                        car, why = found
-                        self.stop(f"{car}: {why}" if car else why, car)
-                elif self.trip is not None and looked - repeated > REPEAT:
-                    repeated = looked
-                    self._gates.stop()
-            except Exception:  # of the network, during a stop: it is repeated
-                continue
+    def _look(self) -> None:
+        before, self._looked = self._looked, self._clock.seconds()
+        self._stalled = not self._stalled and self._looked - before > PERIOD + STALL
+        if self._stalled:  # once: the next look follows at once
+            return
+        with suppress(Exception):  # of the network, during a stop: it is repeated
+            if self._armed:
+                try:
+                    found = next(self._problems(), None)
+                except Exception as error:  # a watchdog that fails has to stop the cars
+                    found = "", f"the watchdog failed: {type(error).__name__}: {error}"
+                if found is not None:
+                    car, why = found
+                    self.stop(f"{car}: {why}" if car else why, car)
+            elif self.trip is not None and self._looked - self._repeated > REPEAT:
+                self._repeated = self._looked
+                self._gates.stop()
 
     def _problems(self) -> Iterator[tuple[str, str]]:
         """Yield the car and the reason of each violated rule; a car is empty where it is no single one."""
@@ -314,7 +310,7 @@ class Watchdog:
         if self._missed >= missed:
             yield "", f"{self._missed} decisions in a row came too late"
         if beat is not None:
-            if (age := time.monotonic() - beat) > (missed + 1) * self._decision:
+            if (age := self._clock.seconds() - beat) > (missed + 1) * self._decision:
                 yield "", f"no decision for {age:.2f} s"
             yield from self.misplaced()
 

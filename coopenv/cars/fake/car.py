@@ -14,12 +14,13 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
 from coopenv.cars.backend.binding import Binding
+from coopenv.cars.clock import Clock
 from coopenv.cars.codec import decode, pose, stamp_of, warm_up
 from coopenv.cars.fake.sensors import LEADER_RATE, TRUTH_RATE, Act, CarSensors, FakeCamera, SensorPublisher
 from coopenv.cars.fake.settings import USUAL, CarFaults, FakeSettings, Wire, end_process, fake_fault, fault_topic
 from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
 from coopenv.cars.gate import PERIOD, GateClock, Malformed, read_drive, write_drive
-from coopenv.cars.gate_process import CLOCK, GateConnection
+from coopenv.cars.gate_process import GateConnection
 from coopenv.cars.profile import RESET_TOPIC, MotionCommand, Role, presence_of
 from coopenv.cars.readings import READERS, CarPose, Sample, read
 from coopenv.cars.transport import Callback, Transport
@@ -43,23 +44,22 @@ class Fake:
         seed: int = 0,
         differential: bool = False,
         gate: Callable[[Transport, GateClock], GateConnection] | None = None,
-        clock: GateClock = CLOCK,
         settings: FakeSettings = USUAL,
     ) -> None:
-        """Put the car at the start of a seed and announce it.
+        """Put the car at the start of a seed. Its gate announces it; a moving landmark announces itself.
 
         Args:
             binding: vehicles and markers of the fleet's cars.
             name: of the car.
-            transport: the network; stays the caller's.
+            transport: the network; stays the caller's. Its wall clock is that of motion capture.
             seed: of where it starts and of its errors, which are those of the simulation with that key.
             differential: the wheels measure a turn rate, because no other sensor does.
             gate: connects a gate of its own, through which commands come; None: it obeys ManualControl on the network.
-            clock: wall and steady; the wall clock is that of motion capture.
             settings: differences from the environment.
         """
         self._settings = settings
-        self.name, self._clock, self._profile, self._faults = name, clock, binding.profile, CarFaults()
+        self._clock = clock = transport.clock
+        self.name, self._profile, self._faults = name, binding.profile, CarFaults()
         scenario, self._drives = binding.scenario, name in binding.cars
         agent = len(scenario.landmarks) + binding.cars[name] if self._drives else binding.leaders[name]
         self.world = CarWorld(scenario, agent, frames=self._profile.sees_frames)
@@ -89,11 +89,11 @@ class Fake:
         transport.subscribe(fault_topic(name), self._later(self._fault))
         if self._drives and gate is not None:
             car_clock = GateClock(lambda: clock.wall() + self._faults.clock_error(clock.steady()), clock.steady)
-            self._link = gate(self._wire, car_clock)  # which lets others see the car
+            self._link = gate(self._wire, car_clock)
             acts.append((1e9 / PERIOD, self._tick_gate))
+        elif self._drives:  # presence is the gate's, and ends with it
+            transport.subscribe(self._profile.topic_of(name, Role.MANUAL), self._later(self.obey))  # on the car
         else:
-            if self._drives:
-                transport.subscribe(self._profile.topic_of(name, Role.MANUAL), self._later(self.obey))  # on the car
             transport.announce(presence_of(name))
         self._now = start = clock.steady()
         self._events, self._phases = sched.scheduler(lambda: self._now, lambda _: None), self._rng
@@ -228,11 +228,11 @@ def replay(
 ) -> Sent:
     """Return a fake's messages under commands at times in ns, up to the last one; `start` is its pose (None: any)."""
     now = commands[0][0]
-    clock = GateClock(lambda: now, lambda: now)
     arrived: list[tuple[str, bytes, int]] = []
     network: Any = SimpleNamespace(**dict.fromkeys(("subscribe", "announce", "watch", "close"), lambda *_: None))
+    network.clock = Clock(lambda: now, lambda: now)
     network.publish = lambda topic, payload, *_, **__: arrived.append((topic, payload, now))  # without other ends
-    fake = Fake(binding, car, network, seed=seed, clock=clock, settings=settings)
+    fake = Fake(binding, car, network, seed=seed, settings=settings)
     if start is not None and start.rotation is not None:
         fake.world.put(fake.world.agent, start.rotation, start.position - np.array(binding.scenario.map.origin))
     waiting = list(reversed(commands))

@@ -17,9 +17,9 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.interrupts import WITH_INPUT, before_a_hard_end, held
 from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
-from coopenv.cars.deployment import load_deployment
+from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.fake.car import Fake
-from coopenv.cars.gate_process import CLOCK, prepare_gate
+from coopenv.cars.gate_process import prepare_gate
 
 READY = 300.0
 """Longest start of fakes, s: the first ones on a computer compile the simulation's kernels."""
@@ -94,6 +94,14 @@ class Process(subprocess.Popen[bytes]):
         _running.remove(self)
 
 
+def fleet_of_fakes(path: str | Path, connect: str | None = None) -> Deployment:
+    """Return a deployment, as `load_deployment` does. Raises FakesError: its cars are real ones."""
+    fleet = load_deployment(path, connect)
+    if not fleet.fakes:
+        raise FakesError(f"{path}: fakes = true is missing, these are real cars")
+    return fleet
+
+
 @contextmanager
 def fakes(deployment: str | Path, port: int | None = None, seed: int = 0, patience: float = READY) -> Iterator[str]:
     """Run a router on this computer and fakes of all cars; yield the router's endpoint, and end them all afterwards.
@@ -114,9 +122,7 @@ def fakes(deployment: str | Path, port: int | None = None, seed: int = 0, patien
         CoopenvError: the file is not valid, or its cars are not fakes.
     """
     endpoint = f"tcp/{LOOPBACK}:{free_port() if port is None else port}"
-    fleet = load_deployment(deployment, endpoint)
-    if not fleet.fakes:
-        raise FakesError(f"{deployment}: fakes = true is missing, these are real cars")
+    fleet = fleet_of_fakes(deployment, endpoint)
     started: list[Process] = []
     until = time.monotonic() + patience
     with tempfile.TemporaryDirectory(prefix="coopenv-fakes-") as place:
@@ -189,6 +195,6 @@ def run(fake: Fake, stop: threading.Event) -> None:
     try:
         while not stop.is_set():
             fake.advance()
-            stop.wait(max((fake.next - CLOCK.steady()) * 1e-9, REST))
+            stop.wait(max((fake.next - time.monotonic_ns()) * 1e-9, REST))
     finally:
         fake.close()

@@ -139,7 +139,7 @@ class Wire:
         """
         self._settings = settings
         self._transport, self._faults, self._steady = transport, faults, steady
-        self.announce, self.watch = transport.announce, transport.watch
+        self.announce, self.watch, self.clock = transport.announce, transport.watch, transport.clock
         self._rng, self._late = random.Random(seed), sched.scheduler(steady, lambda _: None)
 
     def publish(

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -12,14 +11,15 @@ import pytest
 
 from coopenv.backends.base import VehicleBroadcast
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend import buffers
 from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.buffers import StatusBoard
 from coopenv.cars.backend.station import LATE, Gates, Station
 from coopenv.cars.backend.watchdog import BEARING_STD, LinkMonitor, Watchdog, bearing_nis
+from coopenv.cars.clock import CLOCK, Clock, SimulatedClock
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.deployment import Remote, Safety
-from coopenv.cars.gate import Gate, GateClock
+from coopenv.cars.fake.lockstep import Hub
+from coopenv.cars.gate import Gate
 from coopenv.cars.gate_process import GateConnection
 from coopenv.cars.profile import SVEA, USUAL, Role
 from coopenv.cars.readings import CarPose, Sample, Twist
@@ -27,7 +27,6 @@ from coopenv.cars.transport import Arrival
 from coopenv.cars.vision import Calibration
 from coopenv.estimation.poses import exp_so3
 from tests.cars.backend.test_assembler import binding
-from tests.helpers.hub import Hub
 from tests.helpers.processes import wait_until
 
 WHEEL = SVEA.topic_of("a", Role.WHEEL)
@@ -181,12 +180,12 @@ def test_cars_stop_in_time_to_stand_inside_the_fence_and_apart(starts: Any, velo
 class Yard:
     """Gates of two cars in this process, and the station's side of them."""
 
-    def __init__(self) -> None:
-        self.hub = Hub()
-        self.clock = GateClock(time.time_ns, time.monotonic_ns)
-        self.links = {car: GateConnection(Gate(car, USUAL, self.clock), self.hub.connect()) for car in ("a", "b")}
+    def __init__(self, clock: Clock) -> None:
+        self.hub, self.clock = Hub(clock), clock
+        self.links = {car: GateConnection(Gate(car, USUAL, clock), self.hub.connect()) for car in ("a", "b")}
         self.gates = Gates(self.hub.connect(), ("a", "b"), USUAL, None)
         self.publish()
+        self.end_speaking = clock.repeat(0.01, self.publish, "gates")
 
     def publish(self) -> None:
         for link in self.links.values():
@@ -197,21 +196,8 @@ class Yard:
 
 
 @pytest.fixture
-def yard(monkeypatch: pytest.MonkeyPatch) -> Yard:
-    made = Yard()
-    monkeypatch.setattr("coopenv.cars.backend.station.time", Ticking(made.publish))
-    return made
-
-
-class Ticking:
-    """The module `time`, in whose sleep the gates go on speaking."""
-
-    def __init__(self, during: Callable[[], None]) -> None:
-        self.during, self.monotonic, self.time_ns = during, time.monotonic, time.time_ns
-
-    def sleep(self, seconds: float) -> None:
-        time.sleep(seconds)
-        self.during()
+def yard() -> Yard:
+    return Yard(SimulatedClock())
 
 
 def states(yard: Yard) -> list[str]:
@@ -229,14 +215,13 @@ def test_an_emergency_stop_during_arming_holds(yard: Yard, monkeypatch: pytest.M
     pressed: list[bool] = []
 
     def during() -> None:
-        yard.publish()
         slow.publish_status()
         if states(yard)[0] == "armed" and not pressed:
             pressed.append(True)
             yard.stop("a")
 
     arm = yard.gates._arm
-    monkeypatch.setattr("coopenv.cars.backend.station.time", Ticking(during))
+    yard.clock.repeat(0.05, during, "the other gate")
     monkeypatch.setattr(
         yard.gates, "_arm", lambda car, on, nonce: arm(car, on, nonce) if car == "a" or not on else None
     )
@@ -270,8 +255,11 @@ def test_what_a_gate_has_said_before_is_not_believed_again(yard: Yard) -> None:
     before = yard.gates.states["a"]
     yard.hub.connect().publish(topic, first.payload)
     assert yard.gates.states["a"] == before and yard.gates.dropped["a"]["out of order"] == 1
-    time.sleep(LATE * 1e-9 + 0.1)
-    yard.hub.connect().publish(topic, heard[-1].payload)
+    last = heard[-1].payload
+    yard.end_speaking()
+    yard.clock.sleep(LATE * 1e-9 + 0.1)
+    before = yard.gates.states["a"]
+    yard.hub.connect().publish(topic, last)
     assert yard.gates.states["a"] == before and yard.gates.dropped["a"]["stale"] == 1
     yard.hub.connect().publish(topic, b"\x00\x01\x00\x00 nonsense")
     assert yard.gates.dropped["a"]["malformed"] == 1
@@ -291,32 +279,37 @@ def refuse(*_message: object) -> None:
     raise Rejected(Reason.SIGNATURE)
 
 
+def watchdog_of(yard: Yard, monitor: LinkMonitor) -> Watchdog:
+    """Return the watchdog of a yard, which needs the wheels of a."""
+    station = Station(yard.hub.connect(), [WHEEL], None, {})
+    return Watchdog(Safety(odometry_age=0.3), station, yard.gates, monitor, ("a",), (), (Role.WHEEL,), 10.0)
+
+
 @pytest.fixture
 def guard(yard: Yard) -> Iterator[tuple[Yard, Watchdog, LinkMonitor]]:
-    monitor, station = LinkMonitor("truth"), Station(yard.hub.connect(), [WHEEL], None, {})
-    made = Watchdog(Safety(odometry_age=0.3), station, yard.gates, monitor, ("a",), (), (Role.WHEEL,), 10.0)
+    monitor = LinkMonitor("truth")
+    made = watchdog_of(yard, monitor)
     yield yard, made, monitor
     made.close()
 
 
 def live(yard: Yard, guard: Watchdog, monitor: LinkMonitor, seconds: float, usable: bool) -> None:
     """Let wheels be heard for a time, and be understood or not."""
-    wire, until = yard.hub.connect(), time.monotonic() + seconds
-    while time.monotonic() < until and guard.trip is None:
+    wire, until = yard.hub.connect(), yard.clock.seconds() + seconds
+    while yard.clock.seconds() < until and guard.trip is None:
         wire.publish(WHEEL, b"whatever")
-        monitor.looked = time.time_ns()
+        monitor.looked = yard.clock.wall()
         if usable:
             monitor.put(sample("a", Role.WHEEL, monitor.looked, Twist(np.zeros(3), None)))
-        yard.publish()
         guard.beat(0)
-        time.sleep(0.01)
+        yard.clock.sleep(0.01)
 
 
 def test_bytes_alone_do_not_keep_a_car_going(guard: tuple[Yard, Watchdog, LinkMonitor]) -> None:
     yard, dog, monitor = guard
     yard.gates.begin()
     yard.hub.connect().publish(WHEEL, b"whatever")
-    monitor.put(sample("a", Role.WHEEL, time.time_ns(), Twist(np.zeros(3), None)))
+    monitor.put(sample("a", Role.WHEEL, yard.clock.wall(), Twist(np.zeros(3), None)))
     dog.arm()
     live(yard, dog, monitor, 0.6, usable=True)
     assert dog.trip is None
@@ -326,24 +319,25 @@ def test_bytes_alone_do_not_keep_a_car_going(guard: tuple[Yard, Watchdog, LinkMo
     assert states(yard) == ["stopped", "stopped"]
 
 
-def test_a_network_that_fails_does_not_end_the_watchdog(
-    guard: tuple[Yard, Watchdog, LinkMonitor], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    yard, dog, _ = guard
+@pytest.mark.parametrize("clock", [CLOCK, SimulatedClock()])
+def test_a_network_that_fails_does_not_end_the_watchdog(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    yard, calls = Yard(clock), list[float]()
+    dog = watchdog_of(yard, LinkMonitor("truth"))
     yard.gates.begin()
-    calls: list[float] = []
 
     def broken() -> None:
-        calls.append(time.monotonic())
+        calls.append(clock.seconds())
         raise OSError("no network")
 
     with monkeypatch.context() as patch:
         patch.setattr(yard.gates, "stop", broken)
         dog.arm()  # nothing has ever been heard of the wheels
-        wait_until(lambda: len(calls) > 2)
-    wait_until(lambda: states(yard) == ["stopped", "stopped"], yard.publish)
+        wait_until(lambda: len(calls) > 2, lambda: clock.sleep(0.01))
+    wait_until(lambda: states(yard) == ["stopped", "stopped"], lambda: clock.sleep(0.01))
     dog.forget()
     dog.arm()
+    dog.close()
+    yard.end_speaking()
 
 
 def test_nothing_is_armed_without_a_watchdog(guard: tuple[Yard, Watchdog, LinkMonitor]) -> None:
@@ -360,12 +354,14 @@ class Talk:
     """A car and the board of its station."""
 
     def __init__(self, needed: bool = True) -> None:
-        self.hub = Hub()
+        self.clock = SimulatedClock()
+        self.hub = Hub(self.clock)
         self.board = StatusBoard(self.hub.connect(), (CAR,), Remote(), needed)
         self.network = self.hub.connect()
 
     def say(self, role: Role, age: float, **fields: Any) -> None:
-        stamp = time.time_ns() - round(age * 1e9)
+        self.clock.sleep(0.001)
+        stamp = self.clock.wall() - round(age * 1e9)
         message = make(SVEA.topics[role].type, header=header(stamp), **fields)
         self.network.publish(SVEA.topic_of(CAR, role), encode(message))
 
@@ -408,13 +404,13 @@ def test_a_car_without_its_conditions_is_not_armed(left_out: Role) -> None:
         assert SVEA.topic_of(CAR, left_out) in talk.obstacle()
 
 
-def test_what_has_been_said_counts_for_two_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    talk, now = Talk(), time.monotonic()
+def test_what_has_been_said_counts_for_two_seconds() -> None:
+    talk = Talk()
     talk.all_is_well()
     talk.board.begin()
-    monkeypatch.setattr(buffers.time, "monotonic", lambda: now + 1.5)
+    talk.clock.sleep(1.5)
     assert talk.obstacle() == talk.board.happened(CAR) == ""
-    monkeypatch.setattr(buffers.time, "monotonic", lambda: now + 2.5)
+    talk.clock.sleep(1.0)
     assert talk.obstacle().endswith(SVEA.topic_of(CAR, Role.STATE))
     assert talk.board.happened(CAR)
 

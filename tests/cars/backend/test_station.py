@@ -14,54 +14,47 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from coopenv.cars.backend import station as module
 from coopenv.cars.backend.assembler import Assembler, Intake
 from coopenv.cars.backend.binding import Binding, bind
 from coopenv.cars.backend.buffers import KEPT, MOST_SAMPLES, Odometer, PlaceTrack
 from coopenv.cars.backend.station import MOST_WAITING, Pacer, Station
+from coopenv.cars.clock import Clock
 from coopenv.cars.codec import MOST_BYTES, encode, header, make
 from coopenv.cars.deployment import Car, Sensors
+from coopenv.cars.fake.lockstep import Hub
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.readings import Twist
 from coopenv.cars.transport import Arrival
 from coopenv.scenario import load_scenario
-from tests.helpers.hub import Hub
 
 PERIOD, TICKS = 0.01, 3
 MS = 1_000_000
 
 
-class Clock:
+class WorkClock(Clock):
     """Time that passes when somebody sleeps or works; waking up takes `late` ns."""
 
     def __init__(self) -> None:
         self.time, self.late = 5_000_000_000, 0
-
-    def monotonic_ns(self) -> int:
-        return self.time
-
-    def time_ns(self) -> int:
-        return self.time + 1_700_000_000_000_000_000
+        super().__init__(lambda: self.time + 1_700_000_000_000_000_000, lambda: self.time)
 
     def sleep(self, seconds: float) -> None:
         self.time += round(seconds * 1e9) + self.late
 
 
 @pytest.fixture
-def clock(monkeypatch):
-    clock = Clock()
-    monkeypatch.setattr(module, "time", clock)
-    return clock
+def clock():
+    return WorkClock()
 
 
-def begun() -> tuple[Pacer, int]:
+def begun(clock: WorkClock) -> tuple[Pacer, int]:
     """Return one that has started, and when that was, ns."""
-    pacer = Pacer(PERIOD, TICKS)
+    pacer = Pacer(PERIOD, TICKS, clock)
     return pacer, pacer.start()
 
 
-def decision(pacer: Pacer, clock: Clock, works: tuple[int, ...]) -> list[int]:
+def decision(pacer: Pacer, clock: WorkClock, works: tuple[int, ...]) -> list[int]:
     """Make one decision whose ticks are followed by so many ns of work; return when its ticks came, ns."""
     pacer.decide()
     times = []
@@ -72,14 +65,14 @@ def decision(pacer: Pacer, clock: Clock, works: tuple[int, ...]) -> list[int]:
 
 
 def test_ticks_come_at_multiples_of_the_period_whatever_the_work_takes(clock):
-    pacer, begin = begun()
+    pacer, begin = begun(clock)
     times = [t for _ in range(50) for t in decision(pacer, clock, (4 * MS, 9 * MS, 6 * MS))]
     assert times == [begin + 10 * MS * k for k in range(1, 151)]
     assert pacer.missed == 0 and pacer.late(1.0) == 0.0
 
 
 def test_a_decision_misses_its_deadline_once_however_often_the_computer_stands_still(clock):
-    pacer, _ = begun()
+    pacer, _ = begun(clock)
     decision(pacer, clock, (200 * MS, 200 * MS, 0))
     assert pacer.missed == 1
     decision(pacer, clock, (0, 0, 200 * MS))
@@ -90,7 +83,7 @@ def test_a_decision_misses_its_deadline_once_however_often_the_computer_stands_s
 
 
 def test_a_late_decision_is_back_on_time_at_its_last_tick_without_having_missed_anything(clock):
-    pacer, begin = begun()
+    pacer, begin = begun(clock)
     decision(pacer, clock, (0, 0, 25 * MS))
     times = decision(pacer, clock, (0, 0, 0))
     assert [t - begin for t in times] == [55 * MS, 55 * MS, 60 * MS]
@@ -99,7 +92,7 @@ def test_a_late_decision_is_back_on_time_at_its_last_tick_without_having_missed_
 
 
 def test_what_takes_longer_than_a_decision_is_counted_once_and_never_made_up_for(clock):
-    pacer, begin = begun()
+    pacer, begin = begun(clock)
     decision(pacer, clock, (0, 0, 75 * MS))  # until 105: the decisions that end at 60 and 90 are over
     times = decision(pacer, clock, (0, 0, 0))
     assert [t - begin for t in times] == [105 * MS, 110 * MS, 120 * MS]
@@ -109,7 +102,7 @@ def test_what_takes_longer_than_a_decision_is_counted_once_and_never_made_up_for
 
 
 def test_a_computer_that_stands_still_between_two_ticks_leaves_that_time_out(clock):
-    pacer, begin = begun()
+    pacer, begin = begun(clock)
     pacer.decide()
     pacer.wait()
     clock.time += 3_000 * MS
@@ -120,7 +113,7 @@ def test_a_computer_that_stands_still_between_two_ticks_leaves_that_time_out(clo
 
 
 def test_late_waking_is_measured_and_does_not_add_up(clock):
-    pacer, begin = begun()
+    pacer, begin = begun(clock)
     clock.late = 2 * MS
     for _ in range(20):
         times = decision(pacer, clock, (1 * MS, 1 * MS, 1 * MS))
@@ -130,16 +123,14 @@ def test_late_waking_is_measured_and_does_not_add_up(clock):
 
 @given(st.lists(st.integers(0, 200 * MS), min_size=1, max_size=30))
 def test_whatever_the_work_takes_commands_are_never_sent_in_a_burst(works):
-    clock = Clock()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "time", clock)
-        (pacer, begin), sent = begun(), []
-        for work in works:
-            pacer.decide()
-            sent.append(pacer.now() - begin)
-            for _ in range(TICKS):
-                pacer.wait()
-            clock.time += work
+    clock = WorkClock()
+    (pacer, begin), sent = begun(clock), []
+    for work in works:
+        pacer.decide()
+        sent.append(pacer.now() - begin)
+        for _ in range(TICKS):
+            pacer.wait()
+        clock.time += work
     assert len({t // (30 * MS) for t in sent}) == len(sent), "two commands within one interval"
     assert pacer.missed <= sum(work >= 30 * MS for work in works[:-1])
     assert pacer.missed >= sum(work >= 60 * MS for work in works[:-1])

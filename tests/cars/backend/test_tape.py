@@ -6,7 +6,6 @@ import json
 import struct
 import sys
 import threading
-import time
 import warnings
 from collections import Counter
 from contextlib import suppress
@@ -29,12 +28,12 @@ from coopenv.backends.mcap import read_recording
 from coopenv.base.errors import DataError, DataWarning, OutputError
 from coopenv.cars.backend.drive import PRESENCE, Drive, DriveRecorder, RecordedTransport, is_drive
 from coopenv.cars.codec import MOST_BYTES, TICK, encode, header, make
+from coopenv.cars.fake.lockstep import Hub
 from coopenv.cars.profile import STOPPED_TOPIC, SVEA, TICK_TOPIC, Role, presence_of
 from coopenv.runs.command import execute, report
 from coopenv.runs.demo import links_report
 from coopenv.runs.rollouts import Rollout
 from tests.helpers.cars import cars, fakes, write_fleet
-from tests.helpers.hub import Hub
 from tests.helpers.processes import DEADLOCK, start
 
 WHEEL, FRAMES = SVEA.topic_of("svea7", Role.WHEEL), SVEA.topic_of("svea7", Role.DETECTIONS)
@@ -243,7 +242,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, dict[
 
             result = execute("lab", run, folder / "out", log, {}, None, None, False, press_after_a_while)
             links_report(backend, out)
-            time.sleep(0.3)
+            hub.clock.sleep(0.3)
         finally:
             backend.close()
     return folder / "drive.mcap", text.getvalue(), result.metrics

@@ -15,16 +15,18 @@ import pytest
 
 import coopenv
 from coopenv.cars.codec import decode
+from coopenv.cars.gate import read_drive
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport import Arrival
 from coopenv.cars.zenoh import open_zenoh
 from tests.helpers.cars import OVERTAKING
-from tests.helpers.processes import COOPENV, started, wait_until
+from tests.helpers.processes import COOPENV, ROOT, started, wait_until
 from tests.helpers.wire import free_endpoint
 
 pytestmark = pytest.mark.slow
 
-AHEAD = np.array([0.2, 0.0], dtype=np.float32)
+AHEAD, FAST = (np.array([share, 0.0], dtype=np.float32) for share in (0.2, 1.0))
+CAR_FILE = ROOT / "docker" / "car-zenoh.json5"
 NEUTRAL = 500.0  # z of a ManualControl that asks for no speed
 DRIVER = """
 import sys
@@ -41,16 +43,17 @@ while env.agents:
 class Fleet:
     """A router and two fake cars, and an ear on what the gates let through."""
 
-    def __init__(self, folder: Path, stack: ExitStack) -> None:
+    def __init__(self, folder: Path, stack: ExitStack, *options: str) -> None:
         self.folder, self._stack, self.endpoint = folder, stack, free_endpoint()
-        self.file = folder / "fleet.toml"
-        self.file.write_text(OVERTAKING + f'[network]\nconnect = ["{self.endpoint}"]\n')
+        self.file, self._inside = folder / "fleet.toml", f"unixsock-stream/{folder}/car.sock"
+        links = f'[network]\nconnect = ["{self.endpoint}"]\n[gate]\nconnect = ["{self._inside}"]\n'
+        self.file.write_text(OVERTAKING + links)
         self.router = self.launch_router()
-        command = (*COOPENV, "svea", "fake", str(self.file), "--car")
-        self.cars = {car: self.launch("ready", *command, car) for car in ("svea7", "svea1")}
+        self.cars = {car: self.launch_car(car, *options) for car in ("svea7", "svea1")}
         self.ear = open_zenoh("client", [self.endpoint])
         stack.callback(self.ear.close)
         self.manual: dict[str, list[tuple[float, float]]] = {car: [] for car in self.cars}
+        self.speeds = dict.fromkeys(self.cars, 0.0)  # last commands, m/s
         self.commands: list[float] = []
         for car in self.cars:
             self.ear.subscribe(SVEA.topic_of(car, Role.MANUAL), lambda arrival, car=car: self._keep(car, arrival))  # type: ignore[misc]
@@ -61,7 +64,16 @@ class Fleet:
         return self._stack.enter_context(started(command, self.folder, line))
 
     def launch_router(self) -> Any:
-        return self.launch("ready", *COOPENV, "svea", "router", "--listen", self.endpoint)
+        """Start a car's router with the shipped file; the gates connect to its unix socket."""
+        listen = ("--listen", self.endpoint, "--listen", self._inside)
+        return self.launch("ready", *COOPENV, "svea", "router", "--config", str(CAR_FILE), *listen)
+
+    def launch_car(self, car: str, *options: str) -> Any:
+        command = ("fake", str(self.file), "--car", car, "--connect", self._inside, *options)
+        return self.launch("ready", *COOPENV, "svea", *command)
+
+    def launch_gate(self, car: str) -> Any:
+        return self.launch("ready", *COOPENV, "svea", "gate", str(self.file), "--car", car)
 
     def launch_driver(self) -> Any:
         """Start an environment that drives, and wait until its cars move."""
@@ -72,6 +84,7 @@ class Fleet:
     def _keep(self, car: str, arrival: Arrival) -> None:
         z = float(decode(arrival.payload, SVEA.topics[Role.MANUAL].type).z)
         self.manual[car].append((time.monotonic(), z))
+        self.speeds[car] = read_drive(arrival.payload, SVEA.command).speed
 
     def moves(self, car: str) -> bool:
         return bool(self.manual[car]) and self.manual[car][-1][1] < NEUTRAL - 1.0
@@ -94,11 +107,11 @@ def armed(fleet: Fleet) -> coopenv.CooperativeLocalisationEnv:
     return env
 
 
-def drive(env: coopenv.CooperativeLocalisationEnv, seconds: float) -> dict[str, Any]:
+def drive(env: coopenv.CooperativeLocalisationEnv, seconds: float, action: np.ndarray = AHEAD) -> dict[str, Any]:
     infos: dict[str, Any] = {}
     until = time.monotonic() + seconds
     while env.agents and time.monotonic() < until:
-        infos = env.step(dict.fromkeys(env.agents, AHEAD))[-1]
+        infos = env.step(dict.fromkeys(env.agents, action))[-1]
     return infos
 
 
@@ -131,6 +144,23 @@ def test_a_car_that_freezes_is_noticed_and_the_others_stop(fleet: Fleet) -> None
     finally:
         os.kill(fleet.cars["svea1"].pid, signal.SIGCONT)
         env.close()
+
+
+def test_a_gate_that_is_killed_stops_the_other_car(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        fleet = Fleet(tmp_path, stack, "--no-gate")
+        gates = {car: fleet.launch_gate(car) for car in fleet.cars}
+        env = armed(fleet)
+        stack.callback(env.close)
+        wait_until(lambda: fleet.speeds["svea7"] > 0.45, lambda: drive(env, 0.05, FAST))
+        gates["svea1"].kill()
+        killed = time.monotonic()
+        infos = drive(env, 3.0, FAST)
+        assert not env.agents and infos["vehicle_1"]["car"]["stopped"] == "svea1: is gone"
+        wait_until(lambda: not fleet.moves("svea7"))
+        taken = fleet.neutral_since("svea7") - killed
+        print(f"svea7: neutral {1e3 * taken:.0f} ms after the death of svea1's gate")
+        assert taken < 0.35
 
 
 def test_a_router_that_dies_stops_all_and_arming_again_goes_on(fleet: Fleet) -> None:

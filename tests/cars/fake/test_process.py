@@ -22,10 +22,12 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
 from coopenv.cars.backend.station import Gates
+from coopenv.cars.clock import SimulatedClock
 from coopenv.cars.codec import MOST_BYTES, encode, make
 from coopenv.cars.deployment import DeploymentError, Safety, load_deployment
 from coopenv.cars.fake.fleet import FakesError, free_port
 from coopenv.cars.fake.fleet import fakes as fake_processes
+from coopenv.cars.fake.lockstep import Hub
 from coopenv.cars.gate import write_status
 from coopenv.cars.keys import load_signer, load_verifier, make_keys
 from coopenv.cars.profile import SVEA, Limits, Role, presence_of
@@ -33,8 +35,7 @@ from coopenv.cars.transport import Arrival
 from coopenv.cars.zenoh import open_zenoh
 from coopenv.cli.app import app
 from coopenv.cli.svea import next_message
-from tests.helpers.cars import OVERTAKING, fakes, open_fake, write_fleet
-from tests.helpers.hub import Hub
+from tests.helpers.cars import OVERTAKING, open_fake, write_fleet
 from tests.helpers.processes import ROOT, mentioning, start, wait_until
 from tests.helpers.wire import free_endpoint, seen_by
 
@@ -57,18 +58,20 @@ def test_a_gate_obeys_the_given_senders(fleet: Path) -> None:
     fleet.write_text(fleet.read_text() + '[security]\nkeys = "keys"\n')
     keys = fleet.parent / "keys"
     make_keys(keys, ["svea7", "svea1", "station"])
-    with fakes(fleet, station="svea7") as (hub, _):
-        here, verifier = hub.connect(), load_verifier(keys)
-        own, other = (
-            Gates(here, ("svea7",), LIMITS, load_signer(keys, name), verifier) for name in ("svea7", "station")
-        )
-        wait_until(lambda: other.states["svea7"].state == own.states["svea7"].state == "disarmed")
-        with pytest.raises(CoopenvError, match="svea7"):
-            other.begin()
-        assert own.states["svea7"].state == "disarmed"
-        own.begin()
-        assert own.states["svea7"].state == "armed"
-        own.end()
+    hub = Hub(clock := SimulatedClock())
+    car = open_fake(fleet, "svea7", hub.connect(), station="svea7")
+    clock.join(lambda: car.next, car.advance)
+    here, verifier = hub.connect(), load_verifier(keys)
+    signers = [load_signer(keys, name) for name in ("svea7", "station")]
+    own, other = (Gates(here, ("svea7",), LIMITS, signer, verifier) for signer in signers)
+    clock.sleep(0.3)
+    assert other.states["svea7"].state == own.states["svea7"].state == "disarmed"
+    with pytest.raises(CoopenvError, match="svea7"):
+        other.begin()
+    assert own.states["svea7"].state == "disarmed"
+    own.begin()
+    assert own.states["svea7"].state == "armed"
+    own.end()
     with pytest.raises(CoopenvError, match="no public key of 'svea9'"):
         open_fake(fleet, "svea7", Hub().connect(), station="svea9")
 

@@ -21,6 +21,7 @@ from coopenv.cars.backend.binding import bind
 from coopenv.cars.codec import decode, encode, header, make, stamp_of
 from coopenv.cars.deployment import DeploymentError, Sensors, load_deployment
 from coopenv.cars.fake.fleet import fakes
+from coopenv.cars.fake.lockstep import LockstepFakes
 from coopenv.cars.fake.settings import FakeSettings
 from coopenv.cars.profile import SVEA, CarProfile, Role, load_profile
 from coopenv.cars.readings import read
@@ -166,8 +167,15 @@ def fleet(tmp_path: Path) -> Path:
     return path
 
 
+def test_from_frames_to_an_estimate(fleet: Path) -> None:
+    """On a simulated clock; the cars drive, then stand until they know where."""
+    with closing(coopenv.parallel_env("cars", backend=LockstepFakes(fleet).station())) as env:
+        assert drive(env) == ""
+
+
+@pytest.mark.slow
 def test_from_frames_to_an_estimate_through_processes(fleet: Path) -> None:
-    """Fakes, nodes, router and station over Zenoh; the cars drive, then stand until they know where."""
+    """Fakes, nodes, router and station over Zenoh."""
     with fakes(fleet) as endpoint, closing(open_zenoh("client", [endpoint])) as here:
         frames = heard_by(here, FRAMES)
         env = coopenv.parallel_env("svea_overtaking", backend="svea", deployment=fleet, connect=endpoint)

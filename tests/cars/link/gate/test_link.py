@@ -15,7 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.base.errors import CoopenvError
+from coopenv.cars.clock import CLOCK
 from coopenv.cars.codec import decode, encode, header, make
+from coopenv.cars.fake.lockstep import Hub
 from coopenv.cars.gate import (
     ARM,
     BOOL,
@@ -29,13 +31,12 @@ from coopenv.cars.gate import (
     write_drive,
     write_status,
 )
-from coopenv.cars.gate_process import CLOCK, GateConnection, run
+from coopenv.cars.gate_process import GateConnection, run
 from coopenv.cars.profile import NEUTRAL, SVEA, MotionCommand, Role
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR, LIMITS, OTHER, STATION, Bench, messages_of_strangers
 from tests.cars.link.gate.messages import arm, framed_command, stop
 from tests.cars.link.gate.station import Station
-from tests.helpers.hub import Hub
 
 
 class Broken(Gate):

@@ -24,7 +24,7 @@ from coopenv.cli.app import main
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR, messages_of_strangers
 from tests.cars.link.gate.station import Station, running_gate
-from tests.helpers.processes import COOPENV, started, wait_until
+from tests.helpers.processes import COOPENV, ROOT, started, wait_until
 from tests.helpers.wire import free_endpoint, heard_by, running
 
 pytest.importorskip("zenoh", reason="needs the extra 'svea'")
@@ -236,6 +236,26 @@ def test_a_mistake_is_one_error_line(
     assert main(["svea", "gate", *options]) == 2
     error = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: without --keys")]
     assert len(error) == 1 and text in error[0]
+
+
+def test_the_health_check_of_the_image_reads_alone(
+    station: Station, endpoint: str, keys: Path, gate: subprocess.Popen[str], tmp_path: Path
+) -> None:
+    """Where a command to the wheels would get through, an armed gate stays armed."""
+    links = f'network.connect = ["{endpoint}"]\ngate.connect = ["{endpoint}"]\nsecurity.keys = "{keys}"\n'
+    (tmp_path / "fleet.toml").write_text(f'environment = "x"\ncars = [{{ name = "{CAR}" }}]\n{links}')
+    check = re.search(r"CMD coopenv (svea health .*) \|\| exit 1\n", (ROOT / "docker/car.Dockerfile").read_text())
+    assert check is not None
+    here = {"/etc/coopenv/fleet.toml": str(tmp_path / "fleet.toml"), '"$CAR"': CAR}
+    words = [here.get(word, word) for word in check[1].split()]
+    station.arm("a")
+    assert main(words) == 0
+    heard = len(station.statuses)
+    wait_until(lambda: len(station.statuses) > heard + 1)
+    assert station.status.state == "armed" and station.count("foreign") == 0
+    gate.kill()
+    gate.wait()
+    assert main([*words, "--patience", "0.2"]) != 0
 
 
 def test_it_loads_neither_the_simulation_nor_numpy() -> None:
