@@ -27,8 +27,10 @@ from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog, bearing_n
 from coopenv.cars.codec import encode, make, warm_up
 from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.keys import Signer, Verifier, load_keys
-from coopenv.cars.profile import RESET_TOPIC, VELOCITY, Role, presence_of
+from coopenv.cars.profile import RESET_TOPIC, VELOCITY, MotionCommand, Role, presence_of
+from coopenv.cars.readings import Sample
 from coopenv.cars.transport import ReceivingTransport, Transport
+from coopenv.cars.turning import TurnMonitor
 from coopenv.cars.zenoh import open_transport
 from coopenv.estimation.poses import left_covariance
 from coopenv.observers.recording import Sensed
@@ -103,7 +105,7 @@ class Svea:
         self.station = Station(transport, self.intake.topics, verifier, signers)
         self.gates = Gates(transport, cars, deployment.limits, signer, verifier, profile, zenoh)
         self.board = StatusBoard(transport, cars, deployment.remote, deployment.conditions, profile)
-        self.monitor = LinkMonitor(deployment.safety.judge)
+        self.monitor, self._turns = LinkMonitor(deployment.safety.judge), TurnMonitor(binding)
         self.watchdog = Watchdog(
             *(deployment.safety, self.station, self.gates, self.monitor, cars, others, self._odometry),
             *(1.0 / self.scenario.rates.decision, self.board.happened, self._write_down),
@@ -190,11 +192,14 @@ class Svea:
             right = self.deployment.sensors.corrections.get(car)
             own = self.board.obstacles(car, safety.min_battery, self.intake.calibrations[car], right)
             yield from ((car, why) for why in own)
+            if why := self._turns.contradiction(car):
+                yield car, f"its turn rate {why}"
         if safety.judge == "truth":  # estimates are not known before cars drive
             yield from self.watchdog.misplaced()
 
     def advance(self, command: Command) -> Iterator[Sensed]:
         """Send the commands and yield the ticks of one decision, each when it is due."""
+        self._check_turns(command)
         self.pacer.decide()
         self.watchdog.beat(self.pacer.in_a_row)
         if self._armed:
@@ -213,6 +218,21 @@ class Svea:
                 self.recorder.tick(self._index, now)
             yield self._counted(self._assembler.tick(self._index, now))
 
+    def _check_turns(self, command: Command) -> None:
+        """Stop the cars, or warn if they are not armed, once a second if a turn rate contradicts all else."""
+        now = self.pacer.now()
+        for name, i in self._local.items():
+            sent = MotionCommand(float(command.steering[i]), float(command.speed[i]))
+            self._turns.put(Sample(name, Role.COMMAND, now, now, sent))
+            if self._index % round(self.scenario.rates.camera) >= self.scenario.ticks_per_decision:
+                continue
+            if why := self._turns.contradiction(name):
+                text = f"{name}: its turn rate {why}"
+                if self._armed:
+                    self.watchdog.stop(text, name)
+                else:
+                    warnings.warn(text, DataWarning, stacklevel=2)
+
     def drain(self) -> None:
         """Take the messages that have come."""
         arrivals = self.station.drain()
@@ -223,6 +243,7 @@ class Svea:
             for sample in self.intake.samples(arrival):
                 if self._assembler.put(sample):
                     self.monitor.put(sample)
+                    self._turns.put(sample)
         self.monitor.looked = self.pacer.now()
 
     def _counted(self, tick: Sensed) -> Sensed:

@@ -24,7 +24,7 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, listed
 from coopenv.cars.backend.binding import Binding
-from coopenv.cars.bags.clocks import CAMERAS, Delay, Leads, azimuths_of, checked, jumps, leads_of, moves_of
+from coopenv.cars.bags.clocks import Delay, Leads, checked, jumps, leads_of, moves_of
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TRUTH, Chosen, ClockSettings, MapFrame, TopicMap, select
 from coopenv.cars.bags.topics import NS, TopicRow, regularity, unread_truth
@@ -32,9 +32,8 @@ from coopenv.cars.codec import encode, stamp_of
 from coopenv.cars.gate import read_drive
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, read
-from coopenv.cars.readings import tracks_of as motions_of
 from coopenv.cars.sensor_settings import Correction
-from coopenv.cars.turning import constant_turn_rate
+from coopenv.cars.turning import turn_contradiction
 from coopenv.cars.vision import Calibration
 from coopenv.scenario.sensing import rotation_of
 
@@ -447,12 +446,9 @@ def _notes(tracks: Sequence[Track], clocks: Clocks, given: TopicMap, drifts: Map
 
 def _turn_notes(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Binding) -> Iterator[str]:
     """Yield notes on turn rates that never change although the car turns."""
-    for car, vehicle in binding.cars.items():
-        own = [sample for sample in samples if sample.car == car]
+    for car in binding.cars:
         topics = {entry.role: entry.topic for entry in chosen if entry.car == car}
-        seen = azimuths_of([s for s in own if s.role in CAMERAS], samples[0].stamp, binding, vehicle) if own else None
-        wheelbase = binding.scenario.limits[vehicle].wheelbase
-        if seen and (why := constant_turn_rate(motions_of(own, samples[0].stamp), seen, wheelbase)):
+        if why := turn_contradiction([sample for sample in samples if sample.car == car], binding, car):
             topic = next(topics[role] for role in (Role.IMU, Role.ODOMETRY, Role.WHEEL) if role in topics)
             yield f"topic {topic}: the turn rate of {car} {why}"
 
