@@ -12,7 +12,7 @@ from coopenv.cars.bags.clocks import CAMERAS, azimuths_of
 from coopenv.cars.readings import Sample, Twist, tracks_of
 from coopenv.estimation.poses import Array
 
-TURNED = math.radians(20.0)  # of a car, by anything else than its turn rate
+TURNED = math.radians(10.0)  # of a car, by anything else than its turn rate
 WINDOW, NOISE = 0.4, math.radians(2.0)
 """s over which bearings are compared, and rad by which they change for another reason than a turn."""
 

@@ -219,13 +219,11 @@ class Svea:
             yield self._counted(self._assembler.tick(self._index, now))
 
     def _check_turns(self, command: Command) -> None:
-        """Stop the cars, or warn if they are not armed, once a second if a turn rate contradicts all else."""
+        """Stop the cars, or warn if they are not armed, if a turn rate contradicts all else."""
         now = self.pacer.now()
         for name, i in self._local.items():
             sent = MotionCommand(float(command.steering[i]), float(command.speed[i]))
             self._turns.put(Sample(name, Role.COMMAND, now, now, sent))
-            if self._index % round(self.scenario.rates.camera) >= self.scenario.ticks_per_decision:
-                continue
             if why := self._turns.contradiction(name):
                 text = f"{name}: its turn rate {why}"
                 if self._armed:

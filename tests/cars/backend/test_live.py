@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import closing
@@ -15,12 +16,14 @@ import coopenv
 from coopenv.api.parallel_env import CooperativeLocalisationEnv as Env
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend import assembler
 from coopenv.cars.backend.backend import Svea
 from coopenv.cars.backend.drive import Drive
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.fake.car import Fake
 from coopenv.cars.fake.lockstep import Hub
 from coopenv.cars.profile import RESET_TOPIC, SVEA, Role
+from coopenv.cars.readings import Twist
 from coopenv.cars.transport import Arrival
 from tests.helpers.cars import OVERTAKING, PATIENT, SAFETY, cars, fakes, send_fault, threaded_fakes, write_fleet
 
@@ -377,3 +380,23 @@ def test_a_station_that_only_watches_sends_nothing(
             env.reset(seed=0)
             drive(env, 3)
     assert (RESET_TOPIC in sent, bool(sent), bool(seen)) == (not watch,) * 3
+
+
+def test_a_gyro_that_sends_zeros_stops_the_cars_and_keeps_them_from_arming(
+    lab: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, hub, _ = lab
+    reading = assembler.read
+
+    def dead(role: Role, *args: Any, **options: Any) -> Any:
+        value = reading(role, *args, **options)
+        return Twist(None, np.zeros(3)) if role is Role.IMU else value
+
+    monkeypatch.setattr(assembler, "read", dead)
+    turn = np.array([0.6, 1.0], np.float32)
+    with closing(env_of(cars(path, hub))) as env:
+        env.reset(seed=3, options={"arm": True})
+        stopped = drive(env, 100, turn)["vehicle_1"]["car"]["stopped"]
+        assert re.search(r"svea\d: its turn rate is 0 rad/s in all \d+ messages, while .* turns? it by \d+ deg", stopped)
+        with pytest.raises(CoopenvError, match=r"not armed: svea\d: its turn rate is 0 rad/s"):
+            env.reset(options={"arm": True})
