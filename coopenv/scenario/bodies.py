@@ -363,6 +363,9 @@ class LandmarkGroup(Section):
         return [*boxes, *(math.dist(line.start, line.end) for line in self.lines)]
 
 
+MOST_LANDMARKS = 50_000
+
+
 def with_groups(raw: Any) -> Any:
     """Return the plain data of a scenario with an entry of `landmarks` for each that its groups draw.
 
@@ -382,7 +385,7 @@ def with_groups(raw: Any) -> Any:
         x, y = made.parallelograms[0][0]
         for k in range(made.count):
             name = f"{made.name}_{k + 1}"
-            if name not in there:
+            if name not in there and len(added) <= MOST_LANDMARKS:  # the schema refuses more
                 added.append(
                     {"name": name, "position": [x, y, made.height[0]], "group": made.name, "presence": made.presence}
                 )
