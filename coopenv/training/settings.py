@@ -28,7 +28,7 @@ from coopenv.base.installation import (
     list_envs,
     scenario_path,
 )
-from coopenv.base.sections import NonNegative, Positive, Probability, Section, read_toml, validated
+from coopenv.base.sections import NonNegative, Positive, Probability, Section, read_toml, toml_of, validated
 from coopenv.policies.loader import AGENT_FILE, load_agent
 from coopenv.scenario import Scenario
 from coopenv.scenario.cosimulators import FILES
@@ -450,8 +450,8 @@ def _says(path: Path, plan: TrainingPlan, environment: EnvironmentFile) -> bool:
 def _is_the_agents(path: Path) -> bool:
     """Return whether `coopenv train` has written a file that was not changed since."""
     try:
-        card: dict[str, Any] = tomllib.loads((path.parent / AGENT_FILE).read_text(encoding="utf-8"))
+        card: dict[str, Any] = toml_of((path.parent / AGENT_FILE).read_text(encoding="utf-8"))
         known = card["training"].get("settings")  # earlier versions noted none
         return known is None or known == sha256(path.read_bytes()).hexdigest()
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, KeyError, AttributeError):
+    except (OSError, ValueError, RecursionError, KeyError, AttributeError):
         return False
