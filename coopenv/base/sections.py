@@ -15,6 +15,7 @@ from textwrap import dedent
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import SchemaValidator
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed, regular, shortened, shown, suggest
 
@@ -202,11 +203,39 @@ def validated(model: type[Model], raw: Any, where: str, error: type[CoopenvError
         CoopenvError: of class `error`; one line that names the field.
     """
     try:
-        if isinstance(raw, str | bytes):
-            return model.model_validate_json(raw, strict=True)
-        return model.model_validate(raw)
+        return parsed(model, raw)
     except ValidationError as problem:
         raise error(one_line(problem, where, model)) from None
+
+
+SMALL = 2**17
+"""Characters of a JSON text all of whose problems are counted. Each problem takes a kilobyte."""
+
+
+def parsed(model: type[Model], raw: Any) -> Model:
+    """Return plain data as a model; lists that are not part of a small text are read up to their first problem.
+
+    Raises:
+        ValidationError: the data are not of the model.
+    """
+    is_text = isinstance(raw, str | bytes)
+    if is_text and len(raw) <= SMALL:
+        return model.model_validate_json(raw, strict=True)
+    validator = _failing_fast(model)
+    made: Model = validator.validate_json(raw, strict=True) if is_text else validator.validate_python(raw)
+    return made
+
+
+@cache
+def _failing_fast(model: type[BaseModel]) -> SchemaValidator:
+    def changed(node: Any) -> Any:
+        if isinstance(node, dict):
+            more = {"fail_fast": True} if node.get("type") in ("list", "tuple", "set") else {}
+            return {key: changed(value) for key, value in node.items()} | more
+        return type(node)(map(changed, node)) if type(node) in (list, tuple) else node
+
+    model.model_rebuild()  # builds what is deferred
+    return SchemaValidator(changed(model.__pydantic_core_schema__))
 
 
 TOO_DEEP = "lists or tables stand too deep in one another"

@@ -15,7 +15,7 @@ from pydantic import Field, PositiveFloat, ValidationError
 from coopenv.base import installation
 from coopenv.base.errors import CoopenvError, error_text, printable, shown, suggest
 from coopenv.base.installation import data_directory, list_agents
-from coopenv.base.sections import Section, one_line, read_toml
+from coopenv.base.sections import Section, one_line, parsed, read_toml
 from coopenv.policies.base import PLAIN, Policy, decide, restart
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def read_card(folder: Path) -> AgentCard:
     path = folder / AGENT_FILE
     raw = read_toml(path)
     try:
-        return AgentCard.model_validate(raw)
+        return parsed(AgentCard, raw)
     except ValidationError as error:
         errors = error.errors(include_url=False)
         if all(each["type"] == "missing" and each["loc"][-1] in LATER_FIELDS for each in errors):

@@ -20,6 +20,7 @@ from coopenv.base.sections import (
     Vector2,
     Vector3,
     Word,
+    parsed,
 )
 from coopenv.scenario.learning import Dynamics
 from coopenv.scenario.sensing import Camera, Faults, Noise
@@ -379,7 +380,7 @@ def with_groups(raw: Any) -> Any:
     added = []
     for group in groups:
         try:
-            made = LandmarkGroup.model_validate(group)
+            made = parsed(LandmarkGroup, group)
         except ValueError:
             return raw
         x, y = made.parallelograms[0][0]

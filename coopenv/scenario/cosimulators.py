@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import Field
 
 from coopenv.base.errors import ScenarioError, regular, shown
-from coopenv.base.sections import NonNegative, Number, Positive, Section, Word
+from coopenv.base.sections import NonNegative, Number, Positive, Section, Word, parsed
 
 Setting = bool | int | Number | Word | tuple[Number, ...] | None
 File = Annotated[str, Field(min_length=1, max_length=1_000)]
@@ -162,7 +162,7 @@ def with_sumo(raw: Any) -> Any:
     if section is None or raw.get("backend") != "sumo":
         return raw
     try:
-        made = Sumo.model_validate_json(json.dumps(section))
+        made = parsed(Sumo, json.dumps(section))
     except (TypeError, ValueError):
         return raw
     lists = [raw.get(key, []) for key in ("landmarks", "obstacles", "routes", "vehicles", "roads")]
