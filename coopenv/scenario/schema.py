@@ -484,16 +484,16 @@ def _check_room(s: Scenario) -> None:
     overlap.
     """
     routes = {route.name: route for route in s.routes}
-    equal: dict[Any, int] = {}  # vehicles that start in the same boxes have one number
-    kinds = [
-        equal.setdefault((v.routes, v.initial_pose, v.body, dict(v.motion).get("waypoints")), len(equal))
-        for v in s.vehicles
-    ]
-    boxes: list[Boxes] = []
-    for i in [kinds.index(kind) for kind in range(len(equal))]:
-        boxes.append(possible_boxes(s.vehicles[i], routes))
-        if sum(len(part.half) for part in boxes) > MOST_STARTS:
-            raise ValueError(f"vehicles.{i}: routes and spreads of the vehicles to here are over {MOST_STARTS:,} starts")
+    equal: dict[Any, int] = {}
+    kinds: list[int] = []  # vehicles that start in the same boxes have one number
+    boxes, count = list[Boxes](), 0
+    for i, v in enumerate(s.vehicles):
+        kinds.append(equal.setdefault((v.routes, v.initial_pose, v.body, dict(v.motion).get("waypoints")), len(equal)))
+        if len(equal) > len(boxes):
+            boxes.append(possible_boxes(v, routes))
+            count += len(boxes[-1].half)
+        if count > MOST_STARTS:
+            raise ValueError(f"vehicles.{i}: routes and spreads up to this vehicle are over {MOST_STARTS:,} starts")
     if s.obstacles:
         walls = Boxes(
             np.array([o.center for o in s.obstacles]),
