@@ -280,7 +280,9 @@ def load_reference(reference: str) -> Any:
     try:
         with redirect_stdout(sys.stderr), _importing_from(Path.cwd()) if path is None else nullcontext():
             module = _module_of(path, path.stat().st_mtime_ns) if path is not None else import_module(place)
-    except (Exception, SystemExit) as error:  # anybody's code
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # anybody's code
         raise CoopenvError(f"'{reference}' cannot be loaded: {error_text(error)}") from error
     if not hasattr(module, name):
         known = [known for known in vars(module) if not known.startswith("_")]
@@ -333,9 +335,9 @@ def blamed(subject: str, kind: type[CoopenvError] = CoopenvError) -> Iterator[No
     """
     try:
         yield
-    except CoopenvError:
+    except (CoopenvError, KeyboardInterrupt):
         raise
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
         last = extract_tb(error.__traceback__)[-1]
         where = f"{Path(last.filename).name}:{last.lineno}"
         raise kind(f"{subject} failed at {where}: {error_text(error)}") from error

@@ -115,7 +115,9 @@ class Agent(AgentCard):
             return cast(Policy, made)
         try:
             policy: Policy = made(scenario, **self.options)
-        except (Exception, SystemExit) as error:  # code of a user
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # code of a user
             plain = isinstance(error, ValueError | TypeError | KeyError)
             raise CoopenvError(
                 f"agent '{self.name}' cannot be built: {error if plain else error_text(error)}"

@@ -273,7 +273,12 @@ def test_files_of_simulators_are_read_with_their_digests_only(folder: Path, bund
 def test_long_names_of_a_bundle_are_shortened(folder: Path, bundled: Path, capsys: pytest.CaptureFixture[str]) -> None:
     many = changed(MANIFEST, "environment", value="A" * 5000)
     versions = changed(MANIFEST, "versions", value={"coopenv": "B" * 5000})
-    file = edited(bundled, lambda parts: (many(parts), versions(parts)) and None)
+
+    def both(parts: dict[str, bytes]) -> None:
+        many(parts)
+        versions(parts)
+
+    file = edited(bundled, both)
     capsys.readouterr()
     assert main(["run", file]) == 0
     printed = capsys.readouterr()
