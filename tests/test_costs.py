@@ -6,7 +6,6 @@ doubled three times.
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 import tracemalloc
@@ -212,7 +211,8 @@ def bag(form: str) -> Callable[[int, Path], Work]:
 
 def payload(n: int, folder: Path) -> Work:
     codec = pytest.importorskip("coopenv.cars.codec", reason="needs the extra 'svea'")
-    rows = [codec.make("pixy_camera/msg/ObjectBearing", id=i, bearing_x=1.0, bearing_y=0.0, bearing_z=0.0) for i in range(n)]
+    one = "pixy_camera/msg/ObjectBearing"
+    rows = [codec.make(one, id=i, bearing_x=1.0, bearing_y=0.0, bearing_z=0.0) for i in range(n)]
     kind = "pixy_camera/msg/ObjectBearingArrayStamped"
     sent = codec.encode(codec.make(kind, header=codec.header(1), bearing=rows))
     return lambda: codec.decode(sent, kind)
@@ -351,6 +351,6 @@ def test_costs_grow_as_stated(row: Row, tmp_path: Path) -> None:
 
 
 def test_the_page_lists_these_rows() -> None:
-    table = re.findall(r"^\| (?!input|---)([^|]+) \| ([^|]+) \| ([^|]+) \|$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    page = PAGE.read_text(encoding="utf-8")
+    table = re.findall(r"^\| ([^|]+) \| ([^|]+) \| (n|n\^2) \|$", page, re.MULTILINE)
     assert table == [(row.name, row.size, "n" if row.order == 1 else f"n^{row.order}") for row in ROWS]
-    assert json.dumps(table).isascii()

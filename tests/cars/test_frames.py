@@ -14,8 +14,8 @@ import coopenv
 from coopenv import CoopenvError
 from coopenv.backends.base import Command
 from coopenv.backends.sources import simulation_of
-from coopenv.cars.frames import FrameRenderer, PlacedTag
-from coopenv.cars.vision import dictionary_of, opencv
+from coopenv.cars.frames import FrameRenderer, PlacedTag, facing
+from coopenv.cars.vision import Calibration, dictionary_of, opencv
 from coopenv.observers.recording import Sensed
 from coopenv.scenario import Scenario, parse_scenario
 
@@ -119,6 +119,24 @@ class TestWithDetector:
         for tag in drawn[-2]:  # upright, and towards the camera
             assert np.allclose(tag.axes[:, 1], [0, 1, 0]) and abs(tag.axes[:, 0] @ tag.place) < 1e-9
             assert np.linalg.det(tag.axes) == pytest.approx(1.0) and tag.axes[:, 2] @ tag.place > 0.0
+
+    @pytest.mark.parametrize("x", [-2.2, -1.9, -1.1, 0.0, 0.8, 2.0])
+    @pytest.mark.parametrize("y", [-1.5, 0.1, 1.55])
+    def test_a_tag_is_painted_whole_up_to_the_edges_of_the_image(
+        self, monkeypatch: pytest.MonkeyPatch, x: float, y: float
+    ) -> None:
+        renderer = FrameRenderer(Calibration.of(yard(IN_VIEW).cameras[0]), "tag16h5")
+        tag = facing(3, np.array([x, y, 3.0]), 0.7)
+
+        def frame() -> np.ndarray:
+            return renderer.render([tag], 0.0, 0.0, np.random.default_rng(0))
+
+        painted = frame()
+        monkeypatch.setattr(renderer, "_box", lambda *_: (slice(0, 240), slice(0, 320)))
+        assert np.array_equal(painted, frame())
+
+    def test_a_family_may_have_exactly_as_many_tags_as_there_are_targets(self) -> None:
+        simulation_of(yard({f"m{n}": [4.0, 0.1 * n, 0.5] for n in range(28)}))
 
     def test_a_tag_outside_the_image_or_unreadable_is_missed(self) -> None:
         assert not any(frame.visible.any() for frame in ticks(yard(IN_VIEW, images={"blur": 12.0}), 3))

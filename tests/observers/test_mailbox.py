@@ -39,8 +39,10 @@ def ages(mail: Mailbox, k: int, vehicle: int, inbox_tick: list[int], clock: list
 
 @pytest.mark.parametrize(
     ("clock", "age"),
-    [(None, 2), ([0, 0, 0], 2), ([0, 1, 0], 1), ([0, 2, 0], 0), ([0, 3, 0], 0), ([0, 50, 0], 0), ([0, -1, 0], 3)]
-    + [([1, 0, 0], 3), ([4, 0, 0], 6), ([6, 0, 0], 8), ([7, 0, 0], 8), ([90, 0, 0], 8), ([0, -90, 0], 8)],
+    [
+        *((None, 2), ([0, 0, 0], 2), ([0, 1, 0], 1), ([0, 2, 0], 0), ([0, 3, 0], 0), ([0, 50, 0], 0), ([0, -1, 0], 3)),
+        *(([1, 0, 0], 3), ([4, 0, 0], 6), ([6, 0, 0], 8), ([7, 0, 0], 8), ([90, 0, 0], 8), ([0, -90, 0], 8)),
+    ],
 )
 def test_ages_of_offset_clocks_are_at_least_zero_and_at_most_the_time(clock: list[int] | None, age: int) -> None:
     mail = mailbox(flight=9)
@@ -152,7 +154,12 @@ def test_altered_messages_state_another_pose() -> None:
 def test_faults_of_a_tick_are_those_that_have_begun() -> None:
     vehicles = [builders.vehicle(), builders.vehicle((3, 0, 0)), builders.vehicle((6, 0, 0))]
     scenario = builders.scenario(vehicles, faults={"lie": {"kind": "jump"}})
-    rows = {"lie": [REPLAY, 0, REPLAY], "lie_replay": [7, 7, 5], "lie_std": [0.5, 0.25, 2.0], "lie_consistent": [1, 0, 1]}
+    rows = {
+        "lie": [REPLAY, 0, REPLAY],
+        "lie_replay": [7, 7, 5],
+        "lie_std": [0.5, 0.25, 2.0],
+        "lie_consistent": [1, 0, 1],
+    }
     table = np.array([*zip(*rows.values(), strict=True)], dtype=[(name, "f8") for name in rows])
     state = {
         "lie_tick": [4, 5, -1],

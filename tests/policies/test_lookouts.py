@@ -501,3 +501,14 @@ def test_boxes_below_the_camera_hide_nothing_and_others_are_where_they_stand() -
     for box, y in zip(houses, (19.0, 28.0), strict=True):
         assert box.center[0] == pytest.approx(turn @ (40.0 - 1.0 - 0.5, y - 2.0 + 1.0), abs=1e-5)
         assert box.forward[0] == pytest.approx(turn @ (math.cos(0.5), math.sin(0.5)), abs=1e-6)
+
+
+def test_a_field_of_view_ends_short_of_the_edges_of_the_image() -> None:
+    lens = {"model": "pinhole", "image_size": [640, 300], "principal_point": [300.0, 170.0], "range": 8.0}
+    camera = square(
+        **{f"camera.{key}": value for key, value in {**lens, "focal_length": [400.0, 250.0]}.items()}
+    ).camera
+    view, margin = FieldOfView(camera), math.radians(1.5)
+    assert view.left == pytest.approx(math.atan(300.0 / 400.0) - margin, abs=1e-12)
+    assert view.right == pytest.approx(-math.atan(340.0 / 400.0) + margin, abs=1e-12)
+    assert view.reach == pytest.approx(0.95 * 8.0) and view.ahead == camera.position[0]

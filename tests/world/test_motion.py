@@ -311,4 +311,4 @@ def test_prepared_motions_last_one_frame_beyond_the_horizon(spread: float, pace:
     begun = [float(t) for t in range(10) if t <= until]
     first, last = found["first"][3:5]
     assert found["start"][first:last].tolist() == begun
-    assert found["linear"][first:last, 0].tolist() == [float(n) for n in range(9)][: len(begun)] + [0.0] * (len(begun) > 9)
+    assert found["linear"][first:last, 0].tolist() == [*(float(n) for n in range(9)), 0.0][: len(begun)]
