@@ -1,4 +1,4 @@
-"""Cost as a contract: every reader and checker of foreign input grows with its input as `docs/reference/costs.md` says.
+"""Cost as a contract: every reader and checker of foreign input grows with its input as `SECURITY.md` says.
 
 Operations are counted, not seconds: calls of functions in Python and C, and the peak of allocated bytes. An input is
 doubled three times.
@@ -39,7 +39,7 @@ from coopenv.training.settings import read_settings
 from tests.helpers import bags, builders, mrclam_files
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "reference" / "costs.md"
+PAGE = ROOT / "SECURITY.md"
 DOUBLINGS = 3
 SLACK = 1.35
 """Of a doubling: containers grow in steps."""

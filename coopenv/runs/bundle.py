@@ -273,10 +273,10 @@ class Bundle:
 
     def _check_options(self, raw: Mapping[str, Any]) -> None:
         """Refuse options with which another simulator would write files or import code."""
-        sumo, highway = (raw.get(key) if isinstance(raw.get(key), dict) else {} for key in ("sumo", "highway"))
-        if sumo.get("options"):
+        sumo, highway = raw.get("sumo"), raw.get("highway")
+        if isinstance(sumo, dict) and sumo.get("options"):
             raise DataError(f"{self.path}: scenario.json: sumo.options: can write files, so it is not replayed")
-        config = highway.get("config")
+        config = highway.get("config") if isinstance(highway, dict) else None
         for key, value in config.items() if isinstance(config, dict) else ():
             if isinstance(value, str) and "." in value and not value.startswith("highway_env."):
                 raise DataError(f"{self.path}: scenario.json: highway.config.{key}: names code: {shown(value)}")

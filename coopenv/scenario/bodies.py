@@ -377,7 +377,7 @@ def with_groups(raw: Any) -> Any:
     if not isinstance(groups, list) or not isinstance(landmarks, list):
         return raw
     there = {mark.get("name") for mark in landmarks if isinstance(mark, Mapping) and "group" in mark}
-    added = []
+    added: list[dict[str, Any]] = []
     for group in groups:
         try:
             made = parsed(LandmarkGroup, group)
