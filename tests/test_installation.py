@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from coopenv.base import installation
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import (
     absolute_reference,
@@ -80,12 +81,14 @@ def test_modules_are_found_from_here(folder: Path, monkeypatch: pytest.MonkeyPat
         ("no.such.module:Mine", "cannot be loaded: ModuleNotFoundError"),
         ("raises.py:Mine", "cannot be loaded: ZeroDivisionError: division by zero$"),
         ("leaves.py:Mine", "cannot be loaded: SystemExit: 3$"),
+        ("ends.py:Mine", "cannot be loaded: GeneratorExit$"),
         ("broken.py:Mine", "cannot be loaded: SyntaxError"),
     ],
 )
 def test_mistakes_are_one_line(folder: Path, reference: str, message: str) -> None:
     (folder / "raises.py").write_text("1 / 0\nclass Mine: ...")
     (folder / "leaves.py").write_text("raise SystemExit(3)\nclass Mine: ...")
+    (folder / "ends.py").write_text("raise GeneratorExit\nclass Mine: ...")
     (folder / "broken.py").write_text("class Mine(")
     with pytest.raises(CoopenvError, match=message) as caught:
         load_reference(reference)
@@ -123,3 +126,13 @@ def test_cores_are_counted_where_there_is_no_affinity(monkeypatch: pytest.Monkey
 
 def test_what_is_not_installed_has_no_version() -> None:
     assert set(versions("numpy", "no-such-distribution")) == {"python", "numpy"}
+
+
+def test_an_interruption_of_own_code_stays_one() -> None:
+    with pytest.raises(KeyboardInterrupt), installation.blamed("own code"):
+        raise KeyboardInterrupt
+    with (
+        pytest.raises(CoopenvError, match=r"own code failed at test_installation\.py:\d+: GeneratorExit"),
+        installation.blamed("own code"),
+    ):
+        raise GeneratorExit

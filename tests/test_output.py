@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import importlib
+import io
 import json
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
 
+from coopenv.base.terminal import Terminal
+from coopenv.cli import options
 from coopenv.cli.app import main
 from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, start
 
@@ -315,3 +319,31 @@ def test_missing_extra(module: str, needed: str, extra: str, monkeypatch: pytest
     monkeypatch.delitem(sys.modules, module, raising=False)
     with pytest.raises(ImportError, match=rf"^{module} needs .+: pip install '\.\[{extra}\]'$"):
         importlib.import_module(module)
+
+
+def test_a_command_prints_a_limited_number_of_warnings(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[str] = []
+    monkeypatch.setattr(warnings, "showwarning", lambda text, *_: shown.append(text))
+    with options.warned():
+        for k in range(100):
+            warnings.warn(f"tick {k} " + "x" * 10_000, RuntimeWarning, stacklevel=1)
+    assert len(shown) == options.MOST_WARNINGS and max(map(len, shown)) < 1000
+    assert capsys.readouterr().err == "warning: further warnings are not printed\n"
+
+
+def test_an_output_that_own_code_has_closed_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = io.StringIO()
+    closed = io.StringIO()
+    closed.close()
+    monkeypatch.setattr(sys, "stdout", closed)
+    monkeypatch.setattr(sys, "stderr", errors)
+    assert main(["list", "envs"]) == 2
+    assert errors.getvalue() == "error: standard output: I/O operation on closed file\n"
+
+
+@pytest.mark.parametrize(("columns", "width"), [("0", 80), ("1", 80), ("19", 80), ("20", 20), ("200", 200)])
+def test_widths_in_which_no_table_fits_are_not_taken(monkeypatch: pytest.MonkeyPatch, columns: str, width: int) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    assert Terminal(file=io.StringIO()).width == width

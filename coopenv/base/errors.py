@@ -15,6 +15,7 @@ from errno import EINVAL
 from functools import wraps
 from hashlib import sha256
 from inspect import signature
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
@@ -22,6 +23,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 MAX_MESSAGE = 600  # characters of an error, which is to be one line that can be read
+
+MOST_WORDS = 2_000  # valid words that a misspelt one is compared with
 
 EVALUATION_SEEDS = range(2**31, 2**32)
 """Seeds whose maps no other seed has: for the evaluation of agents only, not for training."""
@@ -201,7 +204,7 @@ ELSEWHERE = {
 
 def suggest(word: str, valid: Iterable[str]) -> str:
     """Return ` (did you mean 'x'?)` for the nearest valid word, or the one that is called so elsewhere; else ''."""
-    known = {name.lower(): name for name in valid}
+    known = {name.lower(): name for name in islice(valid, MOST_WORDS)}
     same = [other for other in (ELSEWHERE.get(word, ""),) if other in known]
     near = same or get_close_matches(word[:MAX_MESSAGE].lower(), known, n=1)
     return f" (did you mean '{known[near[0]]}'?)" if near else ""

@@ -28,6 +28,23 @@ POLL = 0.02  # s between attempts to lock
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 
 
+@contextmanager
+def muted_errors() -> Iterator[None]:
+    """Drop what libraries meanwhile write to standard error, past Python."""
+    saved = None
+    with suppress(OSError):  # no standard error: nothing to mute
+        saved = os.dup(2)
+    try:
+        if saved is not None:
+            with Path(os.devnull).open("wb") as nothing:
+                os.dup2(nothing.fileno(), 2)
+        yield
+    finally:
+        if saved is not None:
+            os.dup2(saved, 2)
+            os.close(saved)
+
+
 def lock(folder: Path, wait: float = 0.0, shared: bool = False) -> int | None:
     """Return a descriptor that holds a folder until it is closed, or None: no locks, or held by others for `wait` s.
 

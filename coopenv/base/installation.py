@@ -3,6 +3,8 @@
 A class or function of the user's own is named by its import path: `file.py:Name` or `package.module:Name`.
 """
 
+import ast
+import hashlib
 import os
 import platform
 import re
@@ -12,7 +14,7 @@ from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from functools import cache
 from hashlib import sha256
 from importlib import import_module, metadata
-from importlib.machinery import SourceFileLoader
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from shutil import copyfile, copytree, ignore_patterns
@@ -217,6 +219,34 @@ def absolute_reference(reference: str, folder: Path | None = None) -> str:
     return f"{_file(place, folder)}:{name}" if place.endswith(".py") else reference
 
 
+def beside(reference: str, folder: Path, code: dict[str, Path]) -> str:
+    """Return a path or reference of some folder as one to a copy beside; note its file, and imports, in `code`.
+
+    Raises:
+        CoopenvError: two different files have one name.
+    """
+    place, colon, name = absolute_reference(reference, folder).rpartition(":")
+    if colon and not place.endswith(".py"):
+        return reference
+    _add_code(Path(place or name), code)
+    return f"{Path(place).name}:{name}" if colon else Path(name).name
+
+
+def _add_code(path: Path, code: dict[str, Path]) -> None:
+    if path.name in code:
+        if code[path.name] != path:
+            raise CoopenvError(f"{path} and {code[path.name]}: one folder must hold both; give one another name")
+        return
+    code[path.name] = path
+    if path.suffix != ".py":
+        return
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        for name in [node.module or ""] if isinstance(node, ast.ImportFrom) else names:
+            if (imported := path.with_name(f"{name}.py")).is_file():
+                _add_code(imported, code)
+
+
 def check_reference(reference: str) -> Path | None:
     """Return the file of a reference, None for that of a module, without running any code.
 
@@ -250,12 +280,50 @@ def load_reference(reference: str) -> Any:
     try:
         with redirect_stdout(sys.stderr), _importing_from(Path.cwd()) if path is None else nullcontext():
             module = _module_of(path, path.stat().st_mtime_ns) if path is not None else import_module(place)
-    except (Exception, SystemExit) as error:  # anybody's code
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # anybody's code
         raise CoopenvError(f"'{reference}' cannot be loaded: {error_text(error)}") from error
     if not hasattr(module, name):
         known = [known for known in vars(module) if not known.startswith("_")]
         raise CoopenvError(f"'{reference}': no '{name}' in {place}{suggest(name, known)}")
     return getattr(module, name)
+
+
+class _Vouched:
+    """Finds modules of a folder only if they have these digests, of `code/NAME.py`; elsewhere all is as usual."""
+
+    def __init__(self, folder: Path, digests: Mapping[str, str]) -> None:
+        self._folder, self._digests = str(folder.absolute()), digests
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        """Return the module of a name, None if it is not in the folder. Raises ImportError: it is not vouched for."""
+        if path is not None or (found := PathFinder.find_spec(name, [self._folder])) is None:
+            return None  # a part of a package that has been found, or not in the folder
+        if found.origin is None:  # a folder, which any other module of this name precedes
+            found = PathFinder.find_spec(name) or found
+            if found.origin is not None:
+                return None
+        elif file_digest(Path(found.origin)) == self._digests.get(f"code/{name}.py"):
+            return spec_from_file_location(name, found.origin, loader=_FromSource(name, found.origin))
+        raise ImportError(f"{name} of the current folder: no digest of it is stated")
+
+
+@contextmanager
+def importing_vouched(folder: Path, digests: Mapping[str, str]) -> Iterator[None]:
+    """Import from a folder only files with these digests (SHA-256), by the name `code/FILE.py`."""
+    finder: Any = _Vouched(folder, digests)
+    sys.meta_path.insert(0, finder)
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(finder)
+
+
+def file_digest(path: Path) -> str:
+    """Return the digest (SHA-256) of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @contextmanager
@@ -267,9 +335,9 @@ def blamed(subject: str, kind: type[CoopenvError] = CoopenvError) -> Iterator[No
     """
     try:
         yield
-    except CoopenvError:
+    except (CoopenvError, KeyboardInterrupt):
         raise
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
         last = extract_tb(error.__traceback__)[-1]
         where = f"{Path(last.filename).name}:{last.lineno}"
         raise kind(f"{subject} failed at {where}: {error_text(error)}") from error

@@ -15,12 +15,15 @@ from textwrap import dedent
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import SchemaValidator
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed, regular, shortened, shown, suggest
 
 CHANGE = "scenario | {'dotted.key': value} returns a changed scenario"
 _METHODS = ("figure", "model_dump", "model_dump_json")
-MOST_BYTES = 8 * 2**20  # of a file; 20,000 landmarks take one or two million
+MOST_BYTES = 4 * 2**20  # of a file; 20,000 landmarks take one or two million
+MOST_KEYS, MOST_PARTS = 200_000, 16
+"""Parts of all keys of a file, of which Python's parser takes up to a kilobyte each, and parts of one dotted key."""
 
 
 class Section(BaseModel):
@@ -128,17 +131,46 @@ def read_toml(path: Path, error: type[CoopenvError] = CoopenvError, where: str |
             content = stream.read(MOST_BYTES + 1)
         if len(content) > MOST_BYTES:
             raise error(f"{where}: larger than {MOST_BYTES // 2**20} MiB")
-        return tomllib.loads(content.decode("utf-8-sig").replace("\r\n", "\n"))
+        return toml_of(content.decode("utf-8-sig"))
     except OSError as problem:
         raise error(f"{where}: cannot be read ({problem.strerror or problem})") from None
     except UnicodeDecodeError:
         raise error(f"{where}: not a text file, expected TOML") from None
     except RecursionError:
         raise error(f"{where}: {TOO_DEEP}") from None
-    except CoopenvError:
-        raise
-    except ValueError as problem:  # of tomllib itself, or of numbers with thousands of digits
-        raise error(f"{where}: not valid TOML: {problem}") from None
+    except ValueError as problem:
+        raise (problem if isinstance(problem, error) else error(f"{where}: not valid TOML: {problem}")) from None
+
+
+_SKIPPED = re.compile(
+    r"""\"{3}(?:[^"\\]++|\\.|"(?!""))*+(?:"{3,5}|\Z)|'{3}(?:[^']++|'(?!''))*+(?:'{3,5}|\Z)"""
+    r"""|"(?:[^"\\\n]++|\\[^\n])*+"?|'[^'\n]*+'?|\#[^\n]*+""",
+    re.DOTALL,
+)
+"""Strings and comments; one without an end goes on to the end of its line, or with three quotes to that of the file."""
+_LONG_KEY = re.compile(rf'(?<![\w"-])["\w-]++(?:[ \t]*+\.[ \t]*+["\w-]++){{{MOST_PARTS}}}')
+_HEADER = re.compile(r"^[ \t]*\[[^,\n]*+$", re.MULTILINE)
+_FLOAT = re.compile(r'(?<![\w".-])[+-]?\d++\.\d[\w+-]*+(?![ \t]*[.=])')
+
+
+def toml_of(text: str) -> dict[str, Any]:
+    """Return the contents of a TOML document whose keys are limited.
+
+    Python's parser takes time and memory with the square of a dotted key's length. So parts are counted before.
+
+    Raises:
+        ValueError: it is not valid, a key has more than `MOST_PARTS`, or all together more than `MOST_KEYS`.
+    """
+    text = text.replace("\r\n", "\n")
+    plain = _SKIPPED.sub('"', text)
+    if found := _LONG_KEY.search(plain):
+        raise ValueError(f"{shown(found[0])}: a dotted key of more than {MOST_PARTS} parts")
+    dots = plain.count(".") - sum(1 for _ in _FLOAT.finditer(plain))
+    headers = {found[0] for found in _HEADER.finditer(plain)}
+    keys = plain.count("=") + dots + sum(1 + header.count(".") for header in headers)
+    if keys > MOST_KEYS:
+        raise ValueError(f"its keys have {keys:,} parts, more than {MOST_KEYS:,}")
+    return tomllib.loads(text)
 
 
 def with_tables(
@@ -171,11 +203,39 @@ def validated(model: type[Model], raw: Any, where: str, error: type[CoopenvError
         CoopenvError: of class `error`; one line that names the field.
     """
     try:
-        if isinstance(raw, str | bytes):
-            return model.model_validate_json(raw, strict=True)
-        return model.model_validate(raw)
+        return parsed(model, raw)
     except ValidationError as problem:
         raise error(one_line(problem, where, model)) from None
+
+
+SMALL = 2**17
+"""Characters of a JSON text all of whose problems are counted. Each problem takes a kilobyte."""
+
+
+def parsed(model: type[Model], raw: Any) -> Model:
+    """Return plain data as a model; lists that are not part of a small text are read up to their first problem.
+
+    Raises:
+        ValidationError: the data are not of the model.
+    """
+    is_text = isinstance(raw, str | bytes)
+    if is_text and len(raw) <= SMALL:
+        return model.model_validate_json(raw, strict=True)
+    validator = _failing_fast(model)
+    made: Model = validator.validate_json(raw, strict=True) if is_text else validator.validate_python(raw)
+    return made
+
+
+@cache
+def _failing_fast(model: type[BaseModel]) -> SchemaValidator:
+    def changed(node: Any) -> Any:
+        if isinstance(node, dict):
+            more = {"fail_fast": True} if node.get("type") in ("list", "tuple", "set") else {}
+            return {key: changed(value) for key, value in node.items()} | more
+        return type(node)(map(changed, node)) if type(node) in (list, tuple) else node
+
+    model.model_rebuild()  # builds what is deferred
+    return SchemaValidator(changed(model.__pydantic_core_schema__))
 
 
 TOO_DEEP = "lists or tables stand too deep in one another"

@@ -10,6 +10,7 @@ from rich.text import Text
 
 from coopenv.base.errors import printable
 
+NARROWEST = 20  # columns; a terminal that states fewer has 80
 PLAIN: dict[str, Any] = {"markup": False, "highlight": False, "emoji": False}
 
 
@@ -18,7 +19,7 @@ class Terminal(Console):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**{**PLAIN, **options})
-        if self.width < 1:  # COLUMNS=0
+        if self.width < NARROWEST:  # COLUMNS=0
             self.width = 80
 
     def print(self, *objects: Any, **options: Any) -> None:

@@ -209,7 +209,7 @@ class Safety(Section):
     """Time without odometry after which all cars are stopped, s."""
     truth_age: Age = 0.5
     """Time for which a car's position may be unknown, if a geofence or a separation needs it, s."""
-    geofence: tuple[Corner, ...] = ()
+    geofence: tuple[Corner, ...] = Field(default=(), max_length=256)
     """Corners of a polygon that no car may leave, m, in the coordinates of the environment's file (none: no fence)."""
     separation: float = Field(default=0.0, ge=0.0, le=100.0)
     """Least distance between a driven car and any other car of the fleet, m (0: not watched)."""

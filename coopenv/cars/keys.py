@@ -13,7 +13,6 @@ import base64
 import os
 import stat
 import struct
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from coopenv.base.errors import CoopenvError, listed, shown, suggest
 from coopenv.base.files import replace_text, writing
 from coopenv.base.installation import install_command, needing
+from coopenv.base.sections import toml_of
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
@@ -255,7 +255,7 @@ def _read_private(path: Path) -> Ed25519PrivateKey:
 def _read_public(path: Path) -> dict[str, str]:
     text = _read(path, OTHERS_WRITE, "changed by others", "chmod go-w")
     try:
-        keys = tomllib.loads(text.decode())["keys"]
+        keys = toml_of(text.decode())["keys"]
         if not all(is_identity(name) and isinstance(key, str) for name, key in keys.items()):
             raise ValueError
     except (ValueError, KeyError, AttributeError, RecursionError):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from coopenv.base.errors import CoopenvError, listed, shown
+from coopenv.base.files import muted_errors
 from coopenv.base.installation import install_command, needing
 from coopenv.cars.profile import IMAGES, VisionSettings
 from coopenv.estimation.lens import distort, undistort
@@ -202,6 +203,10 @@ def opencv() -> Any:
     return cv2
 
 
+FORMATS = {"JPEG": b"\xff\xd8\xff", "PNG": b"\x89PNG\r\n\x1a\n"}
+"""First bytes of the compressed images that are decoded, as ROS has no others."""
+
+
 ENCODINGS = {
     **dict.fromkeys(("mono8", "8UC1"), (1, "u1", "GRAY2{}")),
     **dict.fromkeys(("mono16", "16UC1"), (1, "u2", "GRAY2{}")),
@@ -225,11 +230,15 @@ def frame_of(message: Any, wanted: Literal["GRAY", "BGR"] = "GRAY") -> NDArray[n
     if not hasattr(message, "encoding"):
         try:
             mode = cv2.IMREAD_GRAYSCALE if wanted == "GRAY" else cv2.IMREAD_COLOR
-            found = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+            known = bytes(data[:8]).startswith((*FORMATS.values(),))
+            with muted_errors():  # of damaged frames the decoders print lines
+                found = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if known else None
         except cv2.error:  # beyond its limits
             found = None
         if found is None:
-            raise CoopenvError(f"data: no image that OpenCV reads, its format is {shown(message.format)}")
+            raise CoopenvError(
+                f"data: no {' or '.join(FORMATS)} image that OpenCV reads, its format is {shown(message.format)}"
+            )
         return np.asarray(found)
     if message.encoding not in ENCODINGS:
         raise CoopenvError(f"encoding: {shown(message.encoding)} is none of {listed(list(ENCODINGS))}")

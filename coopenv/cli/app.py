@@ -239,8 +239,9 @@ def failure_status(error: BaseException) -> int:
         message = f"{words}{options.usage_hint(error)}"
     elif isinstance(error, CoopenvError):
         message = str(error)
-    elif isinstance(error, OSError):
-        message = f"{error.filename or 'standard output'}: {error.strerror or error}"
+    elif isinstance(error, OSError) or getattr(sys.stdout, "closed", False):
+        file, why = getattr(error, "filename", None), getattr(error, "strerror", None)
+        message = f"{file or 'standard output'}: {why or error}"
         drop_output()
     elif type(error).__name__.startswith("WarpCodegen"):  # an own observer's
         message = f"Warp cannot compile a kernel: {error}"
@@ -249,7 +250,7 @@ def failure_status(error: BaseException) -> int:
     else:
         raise error
     if sys.stderr is not None:
-        with suppress(OSError):
+        with suppress(OSError, ValueError):
             print(f"error: {' '.join(message.split())}", file=sys.stderr)
     return 2
 

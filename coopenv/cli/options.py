@@ -20,12 +20,14 @@ import typer
 from typer.core import TyperGroup
 
 from coopenv.base.errors import (
+    MAX_MESSAGE,
     AgentWarning,
     CoopenvError,
     DataWarning,
     ScenarioWarning,
     listed,
     printable,
+    shortened,
     shown,
     suggest,
 )
@@ -487,6 +489,9 @@ def load(environment: str, overrides: dict[str, Any]) -> Any:
     return open_simulation(environment, overrides)
 
 
+MOST_WARNINGS = 20  # of a command; an observer may warn at each tick
+
+
 @contextmanager
 def warned() -> Iterator[None]:
     """Print each warning about scenarios, data and agents meanwhile once, as one line."""
@@ -494,11 +499,16 @@ def warned() -> Iterator[None]:
     printed: set[str] = set()
 
     def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
-        if not issubclass(category, ours):
-            others(message, category, *where)
-        elif (text := f"warning: {printable(str(message))}") not in printed:
-            printed.add(text)
+        text = f"warning: {shortened(printable(str(message)), MAX_MESSAGE)}"
+        if text in printed or len(printed) > MOST_WARNINGS:
+            return
+        printed.add(text)
+        if len(printed) > MOST_WARNINGS:
+            print("warning: further warnings are not printed", file=sys.stderr)
+        elif issubclass(category, ours):
             print(text, file=sys.stderr)
+        else:
+            others(text.removeprefix("warning: "), category, *where)
 
     with warnings.catch_warnings():
         others, warnings.showwarning = warnings.showwarning, show  # type: ignore[assignment]

@@ -4,7 +4,7 @@ A source of ticks drives a group: the runner on a record, the environment on a w
 """
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import perf_counter
 from traceback import extract_tb
@@ -23,6 +23,8 @@ from coopenv.observers.contract import (
     Message,
     Observer,
     ObserverInit,
+    Setup,
+    Tick,
     check_estimate,
     check_message,
 )
@@ -32,9 +34,6 @@ from coopenv.observers.recording import Sensed
 
 class ObserverError(CoopenvError):
     """An observer raised an exception or returned an invalid estimate; the message names vehicle, time and reason."""
-
-
-ANYTHING = (Exception, SystemExit)  # exceptions of an observer, which is foreign code
 
 
 class TimedEstimate(NamedTuple):
@@ -75,7 +74,7 @@ class ObserverGroup:
                 else:
                     observer.reset(poses[i], covariances[i])
                     self._post(i, 0, observer.message(), interference, None)
-            except ANYTHING as error:
+            except BaseException as error:
                 raise self._blamed(error, 0, None if self.joint else i) from error
 
     def update(
@@ -102,7 +101,7 @@ class ObserverGroup:
             self._check(estimate)
             if message is not None:
                 self._post(vehicle, k, message, interference, self.tamper)
-        except ANYTHING as error:
+        except BaseException as error:
             raise self._blamed(error, k, vehicle) from error
         return TimedEstimate(estimate, elapsed)
 
@@ -157,7 +156,7 @@ class ObserverGroup:
                 self._check(estimate)
                 check_message(message)
                 self.mail.bytes[i] += message.size_bytes
-        except ANYTHING as error:
+        except BaseException as error:
             raise self._blamed(error, sensed.index) from error
         return [TimedEstimate(estimate, elapsed) for estimate in estimates]
 
@@ -168,7 +167,9 @@ class ObserverGroup:
             raise CoopenvError("error coordinates must stay the same")
 
     def _blamed(self, error: BaseException, k: int, vehicle: int | None = None) -> ObserverError:
-        """Return an error that names the vehicle, the time and the reason."""
+        """Return an error that names the vehicle, the time and the reason; KeyboardInterrupt itself is raised."""
+        if isinstance(error, KeyboardInterrupt):
+            raise error
         whose = "" if vehicle is None else f"of {self.observer_init.setups[vehicle].name} "
         last = extract_tb(error.__traceback__)[-1]
         where = "" if isinstance(error, CoopenvError) else f" ({Path(last.filename).name}:{last.lineno})"
@@ -187,7 +188,8 @@ class ObserverGroup:
     def checked_state(self, state: Any, begun: bool) -> dict[str, Any]:
         """Return a checked state for `set_state`, from a state of `get_state` of such a group, before or after a start.
 
-        A CoopenvError means that it is of another group. The observers in it are not checked: they can run any code.
+        A CoopenvError means that it is of another group, or that a copy of an observer of this package cannot take a
+        tick. Observers of users are not tried: they can run any code.
         """
         try:
             copied = copy.deepcopy(state)
@@ -201,11 +203,45 @@ class ObserverGroup:
                 raise CoopenvError("not one observer per vehicle, or not with their coordinates")
             copied["mail"] = Mailbox(self.observer_init)
             copied["mail"].set_state(mail)
+            if all(type(observer).__module__.startswith("coopenv.") for observer in observers):
+                self._try(copy.deepcopy(observers))
         except Exception as error:  # of any other value
             raise CoopenvError(f"state: the observers do not fit: {error_text(error)}") from error
         return dict(copied)
+
+    def _try(self, observers: Sequence[Any]) -> None:
+        """Let observers take a tick at a standstill, with a bearing; damaged ones raise any exception."""
+        ticks = [_still(setup, self.observer_init.dt) for setup in self.observer_init.setups]
+        if self.joint:
+            for estimate in observers[0].update(ticks):
+                check_estimate(estimate)
+            return
+        for observer, tick in zip(observers, ticks, strict=True):
+            check_estimate(observer.update(tick))
+            check_message(observer.message())
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore a state of `checked_state`."""
         vars(self).pop("mail", None)
         vars(self).update(state)
+
+
+def _still(setup: Setup, dt: float) -> Tick:
+    """Return a tick of a vehicle that stands and measures the first of its targets ahead."""
+    zero, targets = np.zeros(3), setup.targets[:]
+    return Tick(
+        index=1,
+        time=dt,
+        dt=dt,
+        rotation=np.eye(3),
+        translation=zero,
+        velocity=zero,
+        angular_velocity=zero,
+        targets=targets,
+        bearings=np.tile([1.0, 0.0, 0.0], (len(targets), 1)),
+        valid=np.arange(len(targets)) == 0,
+        landmarks=np.arange(3.0 * setup.landmarks).reshape(-1, 3),
+        messages={},
+        lever_arm=setup.lever_arm,
+        noise=setup.noise.moving(zero, zero),
+    )

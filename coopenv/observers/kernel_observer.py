@@ -18,7 +18,7 @@ from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array, Coordinates, left_covariance
 from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick, check_message
 from coopenv.world.embedded import Embedded, Messages
-from coopenv.world.launch import Launcher
+from coopenv.world.launch import Launcher, start_warp
 from coopenv.world.model import Precision, entry_struct, mat66d, model_struct, precision
 from coopenv.world.state import SCRATCH, allocate, allocate_state, fields, repeated, state_fields, state_sizes
 from coopenv.world.step import observer_kernels
@@ -93,6 +93,7 @@ class KernelObserver:
 
     def __init__(self, embedded: Embedded, setup: Setup) -> None:
         """Allocate the world of a vehicle from its setup."""
+        start_warp()
         p = precision(PRECISION)
         self.embedded, self.setup = embedded, setup
         self._model = model_of(setup, p)

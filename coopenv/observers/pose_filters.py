@@ -5,7 +5,7 @@ The Kalman filters are multiplicative, invariant, iterated and unscented.
 
 import math
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, islice
 from math import inf, sqrt
 from typing import Any, ClassVar
 
@@ -319,7 +319,7 @@ class PerspectivePoints(PoseObserver):
     def chosen(self, tick: Tick, data: BearingMeasurements) -> UncertainPose | None:
         """Return the candidate that agrees with most bearings, then the one nearest to the predicted pose."""
         best, most, nearest = None, 3, inf
-        triples = np.array(list(combinations(range(len(data.bearings)), 3))[:MOST_TRIPLES])
+        triples = np.array([*islice(combinations(range(len(data.bearings)), 3), MOST_TRIPLES)])
         turns, cameras, mask = solve_p3p(data.bearings[triples], data.positions[triples])
         for R, camera in zip(turns[mask], cameras[mask], strict=True):
             start = UncertainPose(LEFT, R, camera - R @ tick.lever_arm, self.state.P)

@@ -287,5 +287,7 @@ def _found(observer: str | Factory) -> RegisteredObserver:
     point = _installed()[observer]
     try:
         return _row(point.load())
-    except (Exception, SystemExit) as error:  # foreign code
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # foreign code
         raise CoopenvError(f"observer '{observer}' ({point.value}) cannot be loaded: {error_text(error)}") from error

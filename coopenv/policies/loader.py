@@ -16,7 +16,7 @@ from pydantic import Field, PositiveFloat, ValidationError
 from coopenv.base import installation
 from coopenv.base.errors import CoopenvError, error_text, explained, printable, shown, suggest
 from coopenv.base.installation import data_directory, list_agents
-from coopenv.base.sections import Section, one_line, read_toml
+from coopenv.base.sections import Section, one_line, parsed, read_toml
 from coopenv.policies.base import PLAIN, Policy, decide, restart
 
 if TYPE_CHECKING:
@@ -116,7 +116,9 @@ class Agent(AgentCard):
             return cast(Policy, made)
         try:
             policy: Policy = made(scenario, **self.options)
-        except (Exception, SystemExit) as error:  # code of a user
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # code of a user
             plain = isinstance(error, ValueError | TypeError | KeyError)
             raise CoopenvError(
                 f"agent '{self.name}' cannot be built: {error if plain else error_text(error)}"
@@ -135,7 +137,7 @@ def read_card(folder: Path) -> AgentCard:
     path = folder / AGENT_FILE
     raw = read_toml(path)
     try:
-        return AgentCard.model_validate(raw)
+        return parsed(AgentCard, raw)
     except ValidationError as error:
         errors = error.errors(include_url=False)
         if all(each["type"] == "missing" and each["loc"][-1] in LATER_FIELDS for each in errors):

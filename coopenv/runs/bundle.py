@@ -2,14 +2,17 @@
 
 A ZIP archive of `manifest.json`, `scenario.json`, `arrays.npz` and, to read, `code/NAME.py`: the user's files of an
 observer and of terms. The manifest holds the digest of every other part, the archive's comment that of the manifest.
-Code in the archive is never executed: a replay needs the same files in the current folder.
+Code in the archive is never executed: a replay needs files with the same digests in the current folder. The files of a
+simulator, such as networks, are not in the archive, their digests are.
 """
 
 import json
 import re
 import zipfile
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
@@ -18,10 +21,17 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from coopenv.base.errors import ActionError, CoopenvError, DataError, error_text, listed
+from coopenv.base.errors import ActionError, CoopenvError, DataError, error_text, listed, shortened, shown
 from coopenv.base.files import replacing_file
 from coopenv.base.format import json_text, jsonable, members_of
-from coopenv.base.installation import data_directory, is_reference, versions
+from coopenv.base.installation import (
+    beside,
+    data_directory,
+    file_digest,
+    importing_vouched,
+    is_reference,
+    versions,
+)
 from coopenv.base.sections import Section, validated
 from coopenv.observers.registry import named, portable
 from coopenv.runs.rollouts import Rollout
@@ -116,18 +126,14 @@ class RunRecord:
         np.savez(buffer, **arrays)  # type: ignore[arg-type]
         parts = {"arrays.npz": buffer.getvalue()}
 
-        def kept(reference: str, folder: Path) -> str:
-            """Keep the code that a reference names, which then needs no folder."""
-            file, name = Path(reference.rpartition(":")[0]), reference.rpartition(":")[2]
-            if file.suffix != ".py":
-                return reference
-            parts[f"code/{file.name}"] = file.read_bytes()
-            return f"{file.name}:{name}"
-
-        scenario = located(run.scenario.model_dump(mode="json", exclude_unset=True), Path(), kept)
+        code: dict[str, Path] = {}
+        keep = partial(beside, code=code)
+        scenario = located(run.scenario.model_dump(mode="json", exclude_unset=True), Path(), keep)
         parts["scenario.json"] = json_text(scenario).encode()
         place = portable(run.scenario.observer.name)
-        observer = kept(place, Path()) if isinstance(place, str) else run.scenario.observer.name
+        named_by_place = isinstance(place, str) and is_reference(place)
+        observer = keep(str(place), Path()) if named_by_place else run.scenario.observer.name
+        parts |= {f"code/{name}": file.read_bytes() for name, file in code.items() if file.suffix == ".py"}
         manifest = Manifest(
             environment=environment,
             seed=run.seed,
@@ -140,7 +146,8 @@ class RunRecord:
             kernels=kernel_hashes(),
             state_tick=before,
             end=RunEnd(tick=self.last, error=str(error or ""), by_driver=by_driver, figures=figures_of(run)),
-            parts={name: sha256(content).hexdigest() for name, content in parts.items()},
+            parts={f"code/{name}": file_digest(file) for name, file in code.items()}
+            | {name: sha256(content).hexdigest() for name, content in parts.items()},
         )
         parts[MANIFEST] = json_text(manifest.model_dump()).encode()
         with replacing_file(path) as new, zipfile.ZipFile(new, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -212,25 +219,30 @@ class Bundle:
     def title(self) -> str:
         """Title of the run."""
         about = self.manifest
-        return f"{about.environment}, {about.observer}, seed {about.seed}, {about.end.tick} ticks"
+        names = f"{shortened(about.environment, 200)}, {shortened(about.observer)}"
+        return f"{names}, seed {about.seed}, {about.end.tick} ticks"
 
     def other_versions(self) -> list[str]:
         """Return the versions of the run, and their differences here."""
         here, made = versions("coopenv", "numpy", "warp-lang"), self.manifest.versions
-        return [f"{name} {made.get(name)}, here {number}" for name, number in here.items() if made.get(name) != number]
+        others = {name: shortened(str(made.get(name))) for name, number in here.items() if made.get(name) != number}
+        return [f"{name} {number}, here {here[name]}" for name, number in others.items()]
 
     def replay(self) -> list[str]:
         """Run it again and return what has come out otherwise, in words; empty: all is as it was.
 
         Raises:
-            CoopenvError: the scenario is not valid, or its observer is not there.
+            CoopenvError: the scenario is not valid, or code or a file is not here that has the digest of the manifest.
         """
+        with importing_vouched(Path.cwd(), self.manifest.parts):
+            return self._replayed()
+
+    def _replayed(self) -> list[str]:
         about, end = self.manifest, self.manifest.end
         raw = located(self.scenario, Path(), self._here)
         if is_reference(about.observer):
             raw["observer"] = {**raw.get("observer", {}), "name": named(self._here(about.observer, Path()))}
-        if isinstance(raw.get("sumo"), dict) and raw["sumo"].get("options"):
-            raise DataError(f"{self.path}: scenario.json: sumo.options: can write files, so it is not replayed")
+        self._check_options(raw)
         scenario = parse_scenario(raw, f"{self.path.name}: scenario.json")
         drivers = [f"vehicles.{i}.motion.driver" for i, driver in enumerate(scenario.drivers) if driver is not None]
         scenario = load_scenario(scenario, dict.fromkeys(drivers))  # their actions are in the file
@@ -259,18 +271,32 @@ class Bundle:
                 differing.append(f"last {name.replace('_', ' ')} {', '.join(f'{value:.4g}' for value in now)}")
         return differing
 
+    def _check_options(self, raw: Mapping[str, Any]) -> None:
+        """Refuse options with which another simulator would write files or import code."""
+        sumo, highway = raw.get("sumo"), raw.get("highway")
+        if isinstance(sumo, dict) and sumo.get("options"):
+            raise DataError(f"{self.path}: scenario.json: sumo.options: can write files, so it is not replayed")
+        config = highway.get("config") if isinstance(highway, dict) else None
+        for key, value in config.items() if isinstance(config, dict) else ():
+            if isinstance(value, str) and "." in value and not value.startswith("highway_env."):
+                raise DataError(f"{self.path}: scenario.json: highway.config.{key}: names code: {shown(value)}")
+
     def _here(self, reference: str, folder: Path) -> str:
-        """Return the path of the user's file of a reference here: code elsewhere, or changed code, does not run."""
+        """Return the path of a reference's file here: without the digest of the manifest it is neither run nor read.
+
+        Files that ship with coopenv, networks, need none.
+        """
         place, colon, name = reference.rpartition(":")
         file = folder.absolute() / Path(place if colon else name).name
-        shipped = data_directory("envs") / file.name  # networks, no code
-        part = f"code/{file.name}"
-        digest = self.manifest.parts.get(part)
-        if digest is not None and not (file.is_file() and sha256(file.read_bytes()).hexdigest() == digest):
-            raise DataError(f"{self.path}: needs its {part} here as {file.name}: unzip and read it")
-        if not file.is_file() and not shipped.is_file():
-            raise DataError(f"{self.path}: needs {file.name} here, which its scenario names: {reference}")
-        return f"{file if file.is_file() else shipped}{colon}{name if colon else ''}"
+        part, shipped = f"code/{file.name}", data_directory("envs") / file.name
+        digest = self.manifest.parts.get(part) if file.suffix == ".py" or not colon else None
+        for path in (file, shipped) if digest else [shipped] * (not colon):
+            if path.is_file() and digest in (None, file_digest(path)):
+                return f"{path}{colon}{name if colon else ''}"
+        if digest is None:
+            raise DataError(f"{self.path}: names {shown(reference)} without the digest of a file: not run, not read")
+        where = f"its {part} here as {file.name}: unzip and read it" if file.suffix == ".py" else f"{file.name} here"
+        raise DataError(f"{self.path}: needs {where}")
 
     def _differing_state(self, run: Rollout) -> list[str]:
         before = {name.removeprefix("state."): array for name, array in self.arrays.items() if name != "actions"}

@@ -20,6 +20,7 @@ from coopenv.base.sections import (
     Vector2,
     Vector3,
     Word,
+    parsed,
 )
 from coopenv.scenario.learning import Dynamics
 from coopenv.scenario.sensing import Camera, Faults, Noise
@@ -363,6 +364,9 @@ class LandmarkGroup(Section):
         return [*boxes, *(math.dist(line.start, line.end) for line in self.lines)]
 
 
+MOST_LANDMARKS = 50_000
+
+
 def with_groups(raw: Any) -> Any:
     """Return the plain data of a scenario with an entry of `landmarks` for each that its groups draw.
 
@@ -373,16 +377,16 @@ def with_groups(raw: Any) -> Any:
     if not isinstance(groups, list) or not isinstance(landmarks, list):
         return raw
     there = {mark.get("name") for mark in landmarks if isinstance(mark, Mapping) and "group" in mark}
-    added = []
+    added: list[dict[str, Any]] = []
     for group in groups:
         try:
-            made = LandmarkGroup.model_validate(group)
+            made = parsed(LandmarkGroup, group)
         except ValueError:
             return raw
         x, y = made.parallelograms[0][0]
         for k in range(made.count):
             name = f"{made.name}_{k + 1}"
-            if name not in there:
+            if name not in there and len(added) <= MOST_LANDMARKS:  # the schema refuses more
                 added.append(
                     {"name": name, "position": [x, y, made.height[0]], "group": made.name, "presence": made.presence}
                 )

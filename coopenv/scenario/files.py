@@ -5,6 +5,7 @@ import re
 import tomllib
 import warnings
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 from coopenv.base.errors import ScenarioError, explained, shown
 from coopenv.base.format import plain
 from coopenv.base.installation import is_scene, scenario_path
-from coopenv.base.sections import TOO_DEEP, Section, read_toml, validated
+from coopenv.base.sections import MOST_BYTES, TOO_DEEP, Section, read_toml, validated
 from coopenv.scenario.bodies import with_groups
 from coopenv.scenario.own_terms import located
 from coopenv.scenario.scenes import MOST_VEHICLES, scene_text
@@ -137,9 +138,19 @@ def repeat_vehicles(raw: dict[str, Any], where: str) -> None:
         if type(count) is not int or not 1 <= count <= MOST_VEHICLES:
             expected = f"expected a whole number 1 to {MOST_VEHICLES}, got {shown(count)}"
             raise ScenarioError(f"{where}: vehicles.{i}.{COUNT_KEY}: {expected}")
+        _check_size(vehicle, count, f"{where}: vehicles.{i}.{COUNT_KEY}")
         repeated += [vehicle, *(deepcopy(vehicle) for _ in range(count - 1))]
     if repeated:
         raw["vehicles"] = repeated
+
+
+def _check_size(table: Any, times: int, where: str) -> None:
+    """Refuse a table that stands for so many that they would take more than a file may."""
+    size = 0
+    with suppress(TypeError, ValueError):  # what is no data is refused later
+        size = times * len(json.dumps(table, default=plain)) if times > 1 else 0
+    if size > 2 * MOST_BYTES:
+        raise ScenarioError(f"{where}: {times} times its length is {size >> 20} MiB, over {2 * MOST_BYTES >> 20} MiB")
 
 
 def apply_vehicle_defaults(raw: Mapping[str, Any], where: str = "scenario") -> dict[str, Any]:
@@ -150,6 +161,7 @@ def apply_vehicle_defaults(raw: Mapping[str, Any], where: str = "scenario") -> d
         raise ScenarioError(f"{where}: {DEFAULTS_KEY}: must be a table, got {shown(defaults)}")
     vehicles = filled.get("vehicles")
     if isinstance(vehicles, list):
+        _check_size(defaults, len(vehicles), f"{where}: {DEFAULTS_KEY}")
         filled["vehicles"] = [_with_defaults(defaults, v) if isinstance(v, dict) else v for v in vehicles]
     return filled
 

@@ -169,15 +169,27 @@ def _problems(route: Route) -> Iterator[str]:
         yield f"start_spread: {route.start_spread:g} m must be below the route's length ({total:g} m)"
 
 
+MOST_FOLLOWERS = 2_000_000
+"""Pairs of routes of which one may follow the other."""
+
+
 def followers(vehicle: Vehicle, routes: Sequence[Route]) -> list[list[int]]:
-    """Return, per route, the numbers of those that may follow: as designed they start within the radius of its end."""
+    """Return, per route, the numbers of those that may follow: as designed they start within the radius of its end.
+
+    Raises:
+        ValueError: there are more than `MOST_FOLLOWERS` pairs.
+    """
     from scipy.spatial import cKDTree  # here, as names are looked up without SciPy
 
     if not routes:
         return []
     starts, ends = (np.array([route.waypoints[end] for route in routes]) for end in (0, -1))
-    allowed = {i for i, route in enumerate(routes) if not vehicle.next_routes or route.name in vehicle.next_routes}
-    near = cKDTree(starts).query_ball_point(ends, vehicle.goal_radius, return_sorted=True)
+    named = {*vehicle.next_routes}
+    allowed = {i for i, route in enumerate(routes) if not named or route.name in named}
+    tree, radius = cKDTree(starts), vehicle.goal_radius
+    if (count := tree.query_ball_point(ends, radius, return_length=True).sum()) > MOST_FOLLOWERS:
+        raise ValueError(f"routes: {count} pairs may follow one another within {radius:g} m, over {MOST_FOLLOWERS:.0e}")
+    near = tree.query_ball_point(ends, radius, return_sorted=True)
     return [[i for i in row if i in allowed] for row in near]
 
 
@@ -289,7 +301,10 @@ def _spline_table(motion: WaypointMotion, initial_rotation: np.ndarray, until: f
     return TwistTable(t, np.vstack([linear / h, rest]), np.vstack([turn / h, rest]), rotation, relative)
 
 
-BLOCK = 200_000  # pairs of boxes that are compared at a time; each takes some 400 bytes
+BLOCK = 20_000
+"""Pairs of boxes that are compared at a time; each takes some 400 bytes."""
+NEAR_COST, MOST_COMPARED = 40, 20_000_000
+"""Cost of two boxes whose spheres overlap, in comparisons of two spheres, and the limit of one search."""
 
 
 def start_of(agent: Landmark | Vehicle, routes: Mapping[str, Route]) -> tuple[np.ndarray, np.ndarray]:
@@ -332,18 +347,18 @@ def boxes_overlap(a: Boxes, b: Boxes) -> NDArray[np.bool_]:
     return np.asarray(~(apart & ~parallel).any(axis=1))
 
 
-def overlapping_pairs(a: Boxes, b: Boxes) -> NDArray[np.int64]:
-    """Return the indices (k, 2) of all boxes of `a` and `b` that overlap, in the order of `a`.
+def overlapping_pairs(a: Boxes, b: Boxes) -> Iterator[NDArray[np.int64]]:
+    """Yield the indices (k, 2) of the boxes of `a` and `b` that overlap, in blocks and in the order of `a`.
 
-    If `b` is `a` itself, each pair of different boxes counts once, the larger index first.
+    If `b` is `a` itself, each pair of different boxes counts once, the larger index first. The search ends at
+    `MOST_COMPARED`, so that its time is bounded.
     """
     radius_a, radius_b = np.linalg.norm(a.half, axis=1), np.linalg.norm(b.half, axis=1)
     axis = np.ptp(b.center, axis=0).argmax() if len(b.center) else 0  # along it boxes are far apart
     order = np.argsort(b.center[:, axis])
     reach = (radius_a + radius_b.max(initial=0.0)) * (1.0 + 1e-9)  # against rounding
     first, last = (np.searchsorted(b.center[order, axis], a.center[:, axis] + side * reach) for side in (-1.0, 1.0))
-    count = last - first
-    found = [np.empty((0, 2), np.int64)]
+    count, compared = last - first, 0
     for rows in np.split(np.arange(len(count)), np.flatnonzero(np.diff(np.cumsum(count) // BLOCK)) + 1):
         before = np.cumsum(count[rows]) - count[rows]
         i = np.repeat(rows, count[rows])
@@ -352,10 +367,12 @@ def overlapping_pairs(a: Boxes, b: Boxes) -> NDArray[np.int64]:
         if b is a:
             near &= j < i
         pairs = np.column_stack([i[near], j[near]])
+        compared += len(near) + NEAR_COST * len(pairs)
         i, j = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T
         overlap = boxes_overlap(Boxes(*(x[i] for x in a)), Boxes(*(x[j] for x in b)))
-        found.append(np.column_stack([i[overlap], j[overlap]]))
-    return np.concatenate(found)
+        yield np.column_stack([i[overlap], j[overlap]])
+        if compared > MOST_COMPARED:
+            return
 
 
 def possible_boxes(vehicle: Vehicle, routes: Mapping[str, Route]) -> Boxes:

@@ -15,7 +15,7 @@ from coopenv.base.columns import facts_html, one_line, picture_html
 from coopenv.base.errors import ScenarioError, ScenarioWarning, check_one_of, listed, shown, suggest
 from coopenv.base.installation import load_reference
 from coopenv.base.sections import Positive, Section, Text, Vector3, overlaid, validated
-from coopenv.scenario.bodies import Landmark, LandmarkGroup, Obstacle, Road, Vehicle
+from coopenv.scenario.bodies import MOST_LANDMARKS, Landmark, LandmarkGroup, Obstacle, Road, Vehicle
 from coopenv.scenario.cosimulators import COSIMULATORS, Cosimulator, Highway, Program, Sumo
 from coopenv.scenario.learning import Action, Difficulty, Dynamics, Observation, Randomisation, Reward, Termination
 from coopenv.scenario.routes import Boxes, Route, followers, overlapping_pairs, possible_boxes, start_of
@@ -34,6 +34,9 @@ FAR_FROM_ORIGIN = 50.0
 """m; beyond it the paper's observer loses accuracy, because it is not invariant to the map origin."""
 
 SAME_PLACE = 1e-6  # m
+
+MOST_STARTS, MOST_CORNERS = 500_000, 1_000_000
+"""Boxes in which vehicles may start, and pairs of them that are compared for a warning."""
 
 READ = "coopenv.load_scenario reads one by name, from a file or from a dict"
 
@@ -75,7 +78,7 @@ class Scenario(Section, metaclass=_Loaded):
     routes: tuple[Route, ...] = Field(default=(), max_length=20_000)
     roads: tuple[Road, ...] = Field(default=(), max_length=50_000)
     obstacles: tuple[Obstacle, ...] = Field(default=(), max_length=50_000)
-    landmarks: tuple[Landmark, ...] = Field(max_length=50_000)
+    landmarks: tuple[Landmark, ...] = Field(max_length=MOST_LANDMARKS)
     landmark_groups: tuple[LandmarkGroup, ...] = Field(default=(), max_length=1_000)
     vehicles: tuple[Vehicle, ...] = Field(min_length=1, max_length=4_096)
     camera: Camera = Camera()
@@ -308,7 +311,7 @@ def _problems(s: Scenario) -> Iterator[str]:
     k, q, targets = s.observer.k, s.observer.q, s.target_names
     if isinstance(k, tuple) and len(k) != len(s.vehicles):
         yield f"observer.k: {len(k)} values for {len(s.vehicles)} vehicles"
-    for name in [name for name in q if name not in targets] if isinstance(q, dict) else ():
+    for name in [*q.keys() - {*targets}][:1] if isinstance(q, dict) else ():
         yield f"observer.q: unknown target {shown(name)}{suggest(name, targets)}; known: {listed(targets)}"
     names = dict.fromkeys(route.name for route in s.routes)
     for key in ("routes", "landmark_groups"):
@@ -326,12 +329,12 @@ def _problems(s: Scenario) -> Iterator[str]:
         if s.horizon * rate > MOST_TICKS:
             yield f"horizon: {s.horizon:g} s at rates.{name} = {rate:g} Hz are over {MOST_TICKS:.0e} samples"
     parts = {"faults": s.faults, **{f"vehicles.{i}.faults": v.faults for i, v in enumerate(s.vehicles) if v.faults}}
-    marks = [landmark.name for landmark in s.landmarks]
+    marks = {landmark.name: None for landmark in s.landmarks}
     for where, faults in parts.items():
         mark = faults.map_error.landmark
         if mark is not None and mark not in marks:
             unknown = f"unknown landmark {shown(mark)}{suggest(mark, marks)}"
-            yield f"{where}.map_error.landmark: {unknown}; known: {listed(marks)}"
+            yield f"{where}.map_error.landmark: {unknown}; known: {listed([*marks])}"
     yield from _problems_of_driving(s)
 
 
@@ -419,7 +422,7 @@ def _problems_of_draws(s: Scenario) -> Iterator[str]:
 
 def _problems_of_sequels(s: Scenario) -> Iterator[str]:
     """Yield where a vehicle arrives and no route goes on."""
-    number, seen = {route.name: i for i, route in enumerate(s.routes)}, set()
+    number, seen, pairs = {route.name: i for i, route in enumerate(s.routes)}, set(), 0
     for i, vehicle in enumerate(s.vehicles):
         if vehicle.goal is not None and not vehicle.routes:
             key = f"vehicles.{i}.routes: needed by a vehicle with a goal where termination.after_arrival"
@@ -429,6 +432,9 @@ def _problems_of_sequels(s: Scenario) -> Iterator[str]:
             continue
         seen.add(kind)
         after = followers(vehicle, s.routes)
+        pairs += len(s.routes) + sum(map(len, after))
+        if pairs > MOST_PAIRS:
+            yield f"vehicles.{i}: over {MOST_PAIRS:.0e} pairs of routes to go through where after_arrival is 'continue'"
         reached: set[int] = set()
         new = {number[name] for name in vehicle.routes}
         while new:
@@ -478,7 +484,16 @@ def _check_room(s: Scenario) -> None:
     overlap.
     """
     routes = {route.name: route for route in s.routes}
-    boxes = [possible_boxes(vehicle, routes) for vehicle in s.vehicles]
+    equal: dict[Any, int] = {}
+    kinds: list[int] = []  # vehicles that start in the same boxes have one number
+    boxes, count = list[Boxes](), 0
+    for i, v in enumerate(s.vehicles):
+        kinds.append(equal.setdefault((v.routes, v.initial_pose, v.body, dict(v.motion).get("waypoints")), len(equal)))
+        if len(equal) > len(boxes):
+            boxes.append(possible_boxes(v, routes))
+            count += len(boxes[-1].half)
+        if count > MOST_STARTS:
+            raise ValueError(f"vehicles.{i}: routes and spreads up to this vehicle are over {MOST_STARTS:,} starts")
     if s.obstacles:
         walls = Boxes(
             np.array([o.center for o in s.obstacles]),
@@ -487,27 +502,48 @@ def _check_room(s: Scenario) -> None:
         )
         everywhere = Boxes(*(np.concatenate(parts) for parts in zip(*boxes, strict=True)))
         whose = np.repeat(np.arange(len(boxes)), [len(part.half) for part in boxes])
-        for box, building in overlapping_pairs(everywhere, walls)[:1].tolist():
-            i, name = int(whose[box]), s.obstacles[building].name
+        for box, building in _pairs(everywhere, walls):
+            i, name = kinds.index(whose[box]), s.obstacles[building].name
             raise ValueError(f"vehicles.{i}.initial_pose: vehicle_{i + 1} starts inside obstacle '{name}'")
     fixed = [i for i, vehicle in enumerate(s.vehicles) if not vehicle.routes]
     starts = np.array([start_of(s.vehicles[i], routes)[0] for i in fixed]).reshape(-1, 3)
     points = Boxes(starts, np.tile(np.eye(3), (len(starts), 1, 1)), np.full_like(starts, SAME_PLACE / 2))
-    for second, first in overlapping_pairs(points, points)[:1].tolist():
+    for second, first in _pairs(points, points):
         raise ValueError(_in_place(s, fixed[second], fixed[first]))
-    nominal = Boxes(*(np.array([part[0] for part in parts]) for parts in zip(*boxes, strict=True)))
-    pairs = overlapping_pairs(nominal, nominal).tolist()
-    pairs = [(i, j) for i, j in pairs if {i, j} <= {*fixed} or _mostly_overlap(s, boxes, i, j)]
-    if pairs:
-        more = f" (and those of {len(pairs) - 1} more pairs)" if len(pairs) > 1 else ""
-        warnings.warn(f"{_in_place(s, *pairs[0])}: their boxes overlap{more}", ScenarioWarning, stacklevel=2)
+    for second, first in _overlapping_starts(s, boxes, kinds):
+        warnings.warn(f"{_in_place(s, second, first)}: their boxes overlap", ScenarioWarning, stacklevel=2)
+        return
 
 
-def _mostly_overlap(s: Scenario, boxes: Sequence[Boxes], i: int, j: int) -> bool:
-    """Return whether two vehicles that are there from the start overlap at most corners of where they may start."""
-    count = len(boxes[i].half) * len(boxes[j].half)
-    waits = s.vehicles[i].entry or s.vehicles[j].entry
-    return not waits and 2 * len(overlapping_pairs(boxes[i], boxes[j])) > count
+def _pairs(a: Boxes, b: Boxes) -> Iterator[list[int]]:
+    return (pair for block in overlapping_pairs(a, b) for pair in block.tolist())
+
+
+def _overlapping_starts(s: Scenario, boxes: Sequence[Boxes], kinds: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """Yield vehicles whose nominal boxes overlap, with routes only if most of their possible boxes do.
+
+    Vehicles that wait for their entry have none. `boxes` are those of each kind of vehicle. The search is for a doubt
+    alone: it ends after `MOST_CORNERS`.
+    """
+    nominal = Boxes(*(np.array([boxes[kind][part][0] for kind in kinds]) for part in range(3)))
+    known: dict[tuple[int, int], bool] = {}
+    compared = 0
+    for i, j in _pairs(nominal, nominal):
+        one, other = s.vehicles[i], s.vehicles[j]
+        if one.routes or other.routes:
+            if one.entry or other.entry:
+                continue
+            key = kinds[i], kinds[j]
+            if key not in known:
+                a, b = boxes[key[0]], Boxes(*boxes[key[1]])  # a copy: all pairs of two vehicles of one kind
+                count = len(a.half) * len(b.half)
+                compared += count
+                if compared > MOST_CORNERS:
+                    return
+                known[key] = 2 * sum(map(len, overlapping_pairs(a, b))) > count
+            if not known[key]:
+                continue
+        yield i, j
 
 
 def _in_place(s: Scenario, second: int, first: int) -> str:
@@ -523,16 +559,16 @@ def neighbour_sets(scenario: Scenario) -> list[list[int]]:
     """
     landmarks, vehicles = len(scenario.landmarks), len(scenario.vehicles)
     index = {name: target for target, name in enumerate(scenario.target_names)}
-    result = []
+    every, result = [*range(landmarks + vehicles)], []  # lists of the same numbers take a fifth of the memory
     for i, vehicle in enumerate(scenario.vehicles):
         own = landmarks + i
         if vehicle.neighbours is None:
-            last = own if scenario.topology.acyclic else landmarks + vehicles
-            result.append([*range(own), *range(own + 1, last)])
+            result.append(every[:own] if scenario.topology.acyclic else every[:own] + every[own + 1 :])
             continue
         where = f"vehicles.{i}.neighbours"
-        for name in vehicle.neighbours:
+        for name in [name for name in vehicle.neighbours if name not in index][:1]:
             check_one_of(f"{where}: unknown target", name, index, ValueError)
+        for name in vehicle.neighbours:
             if index[name] == own:
                 raise ValueError(f"{where}: a vehicle cannot be its own neighbour")
         result.append(sorted({index[name] for name in vehicle.neighbours}))
@@ -548,7 +584,13 @@ def processing_order(scenario: Scenario, neighbours: Sequence[Sequence[int]]) ->
     landmarks = len(scenario.landmarks)
     if not scenario.topology.acyclic:
         return list(range(len(neighbours)))
-    leaders = [[j - landmarks for j in targets if j >= landmarks] for targets in neighbours]
+    leaders, last = list[Sequence[int]](), 0
+    for i, targets in enumerate(neighbours):
+        if scenario.vehicles[i].neighbours is None:  # it follows all before it, so those from the last such one suffice
+            leaders.append(range(last, i))
+            last = i
+        else:
+            leaders.append([j - landmarks for j in targets if j >= landmarks])
     sorter = TopologicalSorter(dict(enumerate(leaders)))
     try:
         sorter.prepare()

@@ -21,6 +21,7 @@ from xml.etree.ElementTree import Element, ParseError, iterparse
 import numpy as np
 
 from coopenv.base.errors import ScenarioError, regular, shown
+from coopenv.base.sections import parsed
 from coopenv.scenario.cosimulators import Sumo
 
 LANE_WIDTH = 3.2
@@ -74,7 +75,7 @@ def with_sumo(raw: Any) -> Any:
     if section is None or raw.get("backend") != "sumo":
         return raw
     try:
-        made = Sumo.model_validate_json(json.dumps(section))
+        made = parsed(Sumo, json.dumps(section))
     except (TypeError, ValueError):
         return raw
     if made.net.endswith(CONFIGURATIONS):
@@ -189,36 +190,43 @@ def _network(path: Path, modified: int) -> SumoNetwork:
     return found
 
 
-MOST_BYTES = 2**30
-"""Of the XML of a network or of routes, unpacked."""
+MOST_BYTES, LEAST_BYTES, MOST_UNPACKED = 2**30, 2**25, 50
+"""Limits of the XML of a network or of routes, unpacked: of every file, and of a small one with its size's factor."""
+MOST_PARTS = 100_000
+"""Parts of one element below the root."""
 
 
 class _LimitedReader:
     """Reads a file up to a limit."""
 
-    def __init__(self, file: Any) -> None:
-        self._file, self._left = file, MOST_BYTES
+    def __init__(self, file: Any, size: int) -> None:
+        self._file, self.most = file, min(MOST_BYTES, LEAST_BYTES + MOST_UNPACKED * size)
+        self._left = self.most
 
     def read(self, size: int = -1) -> bytes:
         """Return bytes of the file. Raises OSError: it has more than the limit."""
         data: bytes = self._file.read(size)
         self._left -= len(data)
         if self._left < 0:
-            raise OSError(EFBIG, f"more than {MOST_BYTES // 2**20} MiB of XML")
+            raise OSError(EFBIG, f"more than {self.most // 2**20} MiB of XML")
         return data
 
 
 def _elements(path: Path) -> Iterator[Element]:
     """Yield the root of a file, plain or .gz, without its content, and then the elements below it."""
-    path, depth = regular(path), 0
+    path, depth, parts = regular(path), 0, 0
     with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-        for event, element in iterparse(_LimitedReader(file), events=("start", "end")):
-            depth += 1 if event == "start" else -1
-            if event == "start" and depth == 1:
+        for event, element in iterparse(_LimitedReader(file, path.stat().st_size), events=("start", "end")):
+            depth, parts = (depth + 1, parts + 1) if event == "start" else (depth - 1, parts)
+            if depth == 1 and event == "start":
+                root = element
                 yield Element(element.tag, element.attrib)
-            elif event == "end" and depth == 1:
+            if parts > MOST_PARTS:
+                raise OSError(EFBIG, f"an element with more than {MOST_PARTS:,} parts")
+            if depth == 1 and event == "end":
                 yield element
-                element.clear()
+                root.clear()
+                parts = 0
 
 
 @contextmanager

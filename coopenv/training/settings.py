@@ -1,6 +1,5 @@
 """The settings of a training, read from a TOML file, its plan, and the files of both beside an agent."""
 
-import ast
 import json
 import re
 import shutil
@@ -20,7 +19,7 @@ from coopenv.backends.sources import open_simulation
 from coopenv.base.errors import CoopenvError, OutputError, check_one_of, listed
 from coopenv.base.files import writing
 from coopenv.base.installation import (
-    absolute_reference,
+    beside,
     data_directory,
     is_reference,
     is_scene,
@@ -28,7 +27,7 @@ from coopenv.base.installation import (
     list_envs,
     scenario_path,
 )
-from coopenv.base.sections import NonNegative, Positive, Probability, Section, read_toml, validated
+from coopenv.base.sections import NonNegative, Positive, Probability, Section, read_toml, toml_of, validated
 from coopenv.policies.loader import AGENT_FILE, load_agent
 from coopenv.scenario import Scenario
 from coopenv.scenario.cosimulators import FILES
@@ -342,40 +341,16 @@ def environment_file(environment: str, overrides: Mapping[str, Any] | None = Non
     return EnvironmentFile(path.stem, name, _movable(path.read_text(encoding="utf-8-sig"), path.parent, code), code)
 
 
-def _beside(reference: str, folder: Path, code: dict[str, Path]) -> str:
-    """Return a path or reference of some folder as one to a copy beside; note its file, and imports, in `code`."""
-    place, colon, name = absolute_reference(reference, folder).rpartition(":")
-    if colon and not place.endswith(".py"):
-        return reference
-    _add_code(Path(place or name), code)
-    return f"{Path(place).name}:{name}" if colon else Path(name).name
-
-
-def _add_code(path: Path, code: dict[str, Path]) -> None:
-    if path.name in code:
-        if code[path.name] != path:
-            raise CoopenvError(f"{path} and {code[path.name]}: one folder must hold both; give one another name")
-        return
-    code[path.name] = path
-    if path.suffix != ".py":
-        return
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-        for name in [node.module or ""] if isinstance(node, ast.ImportFrom) else names:
-            if (imported := path.with_name(f"{name}.py")).is_file():
-                _add_code(imported, code)
-
-
 def _with_code_beside(overrides: Mapping[str, Any], code: dict[str, Path]) -> dict[str, Any]:
     """Return overrides, in which own terms name copies of their files, which are noted in `code`."""
     own = {key: value for key, value in overrides.items() if ".custom." in key and isinstance(value, str)}
-    return {**overrides, **{key: _beside(value, Path.cwd(), code) for key, value in own.items() if is_reference(value)}}
+    return {**overrides, **{key: beside(value, Path.cwd(), code) for key, value in own.items() if is_reference(value)}}
 
 
 def _movable(text: str, folder: Path, code: dict[str, Path]) -> str:
     """Return a scenario of some folder as it means the same with copies of its files and own terms beside it."""
     raw = tomllib.loads(text)
-    changed = located(raw, folder, partial(_beside, code=code))
+    changed = located(raw, folder, partial(beside, code=code))
     if changed == raw:
         return text
     import tomlkit  # of the extra `train`
@@ -450,8 +425,8 @@ def _says(path: Path, plan: TrainingPlan, environment: EnvironmentFile) -> bool:
 def _is_the_agents(path: Path) -> bool:
     """Return whether `coopenv train` has written a file that was not changed since."""
     try:
-        card: dict[str, Any] = tomllib.loads((path.parent / AGENT_FILE).read_text(encoding="utf-8"))
+        card: dict[str, Any] = toml_of((path.parent / AGENT_FILE).read_text(encoding="utf-8"))
         known = card["training"].get("settings")  # earlier versions noted none
         return known is None or known == sha256(path.read_bytes()).hexdigest()
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, KeyError, AttributeError):
+    except (OSError, ValueError, RecursionError, KeyError, AttributeError):
         return False

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from coopenv.base.errors import ScenarioError
 from coopenv.base.sections import Section
 from coopenv.estimation import KINDS, Outcome
 from coopenv.estimation.lens import largest_radius
@@ -175,6 +176,8 @@ GRAMIAN_RATE = 20.0
 """Sampling rate (Hz) of the sliding Gramian, which measures the view of the scene over a second."""
 
 GRAMIAN_BLOCKS = 10  # blocks of the sliding window of the observability Gramian; it moves on by one block
+
+MOST_FILLED = 5_000_000  # pairs of buildings and cells of the grid
 
 MOST_IN_ONE_CELL = 12
 """Bodies, or buildings, of a scene in which all pairs are tested. Sensing of a vehicle takes 0.71 us so, and 0.84 us in
@@ -367,7 +370,11 @@ def _scene(scenario: Scenario) -> dict[str, Any]:
 
 
 def _cells(scenario: Scenario) -> dict[str, Any]:
-    """Return the grid of the world; it has about as many cells as bodies."""
+    """Return the grid of the world; it has about as many cells as bodies.
+
+    Raises:
+        ScenarioError: buildings are in too many cells.
+    """
     origin, obstacles = np.array(scenario.map.origin), scenario.obstacles
     everyone: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
     reaches = [math.hypot(*agent.body.center) + math.hypot(*agent.body.size) / 2 for agent in everyone if agent.body]
@@ -376,11 +383,14 @@ def _cells(scenario: Scenario) -> dict[str, Any]:
     across = 1 if items <= MOST_IN_ONE_CELL else 1 << math.ceil(math.log2(items) / 2)
     ranges = [camera.range for camera in scenario.cameras if camera.range is not None]
     edge = min(ranges, default=LONGEST_CELL) / CELLS_PER_RANGE
-    cells: list[list[int]] = [[] for _ in range(across * across)]
+    cells, filled = [list[int]() for _ in range(across * across)], 0
     for k, obstacle in enumerate(obstacles):
         reach = np.abs(rotation_of(obstacle.yaw, None)) @ np.array(obstacle.size) / 2 * WIDER
         spans = np.floor((obstacle.center - origin + np.outer((-1, 1), reach))[:, :2] / edge).astype(int).T
         columns, rows = (np.unique(np.arange(a, min(b, a + across - 1) + 1) % across) for a, b in spans)
+        filled += len(rows) * len(columns)
+        if filled > MOST_FILLED:
+            raise ScenarioError(f"obstacles: to number {k} the buildings fill over {MOST_FILLED:,} cells of the grid")
         for cell in (rows[:, None] * across + columns).ravel():
             cells[cell].append(k)
     return {

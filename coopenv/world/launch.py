@@ -8,6 +8,7 @@ that several processes need is compiled by one of them.
 """
 
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Hashable, Iterator, Sequence
@@ -23,8 +24,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.base.errors import CoopenvError
-from coopenv.base.files import lock
+from coopenv.base.errors import CoopenvError, shown
+from coopenv.base.files import lock, muted_errors
 from coopenv.base.installation import available_cores
 from coopenv.world.warp_internals import cpu_features, field_types, replay_of
 
@@ -149,19 +150,8 @@ def start_warp() -> None:
     """
     wp.config.log_level = wp.LOG_ERROR
     wp.config.cuda_output = wp.config.cuda_output or "cubin"  # code of the device itself, which `make cuda-check` makes
-    saved = None
-    with suppress(OSError):  # no standard error: nothing to mute
-        saved = os.dup(2)
-    try:
-        if saved is not None:
-            with Path(os.devnull).open("wb") as nothing:
-                os.dup2(nothing.fileno(), 2)
-        with _written():
-            wp.init()
-    finally:
-        if saved is not None:
-            os.dup2(saved, 2)
-            os.close(saved)
+    with muted_errors(), _written():
+        wp.init()
 
 
 @cache
@@ -217,11 +207,14 @@ def compiler_options() -> dict[str, Any]:
     return {"cpu_compiler_flags": " ".join([*kept, threshold])}
 
 
+MOST_THREADS = 1024
+
+
 def default_threads() -> int:
     """Return the largest number of threads of a launch on the CPU: all cores, or COOPENV_THREADS."""
     wanted = os.environ.get("COOPENV_THREADS", "")
-    if wanted and not (wanted.isascii() and wanted.isdecimal() and int(wanted) > 0):
-        raise CoopenvError(f"COOPENV_THREADS must be a positive whole number, got '{wanted}'")
+    if wanted and not (re.fullmatch("[0-9]{1,4}", wanted) and 0 < int(wanted) <= MOST_THREADS):
+        raise CoopenvError(f"COOPENV_THREADS must be a whole number from 1 to {MOST_THREADS}, got {shown(wanted)}")
     return int(wanted or available_cores())
 
 

@@ -10,6 +10,9 @@
 | `kernel_hashes` | `context.user_modules`, `Module.get_module_hash` | versions of kernels in a report of a run |
 | `_kernel_source` | `codegen.codegen_kernel`, `Adjoint.args` | no copies of records; no kernels of the host on CUDA |
 | `_function_source` | `codegen.codegen_func`, `codegen.cpu_module_header` | CPU: indices and loops as in C |
+
+The last two stand in Warp for the whole process. Kernels and functions of other modules get the source that Warp gives
+them; all that their modules have more is the namespace `coopenv`, with one template.
 """
 
 import ctypes
@@ -68,10 +71,12 @@ def _has_arrays(kind: Any) -> bool:
 
 
 ELEMENT = """
+namespace coopenv {{
 template <typename T, typename... Indices>
 CUDA_CALLABLE inline T& element(const wp::array_t<T>& array, Indices... indices)
 {{
     return *wp::data_at_byte_offset(array, wp::byte_offset(array, indices...));
+}}
 }}
 """
 codegen.cpu_module_header += ELEMENT
@@ -88,8 +93,8 @@ def _as_in_c(source: str, function: Callable[..., Any], device: str, options: Ma
     ours = device == "cpu" and str(function.__module__).startswith("coopenv.")
     if not ours or options["enable_backward"] or wp.config.mode == "debug":
         return source
-    source = re.sub(r"wp::array_store\((.*), (\w+)\);", r"element(\1) = \2;", source)
-    source = source.replace("wp::address(", "&element(").replace("wp::index(", "element(")
+    source = re.sub(r"wp::array_store\((.*), (\w+)\);", r"coopenv::element(\1) = \2;", source)
+    source = source.replace("wp::address(", "&coopenv::element(").replace("wp::index(", "coopenv::element(")
     source = re.sub(r"iter_cmp\((\w+)\) == 0", r"\1.i >= \1.end", source)
     head, brace, body = source.partition("\n{")
     return re.sub(r"(\w+\*) (var_\w+)", r"\1 __restrict__ \2", head) + brace + body

@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import coopenv
 from coopenv import CoopenvError
 from coopenv.backends.base import Command
 from coopenv.backends.sources import simulation_of
-from coopenv.cars.vision import dictionary_of, opencv
+from coopenv.cars.frames import FrameRenderer, PlacedTag, facing
+from coopenv.cars.vision import Calibration, dictionary_of, opencv
 from coopenv.observers.recording import Sensed
 from coopenv.scenario import Scenario, parse_scenario
 
@@ -91,6 +93,50 @@ class TestWithDetector:
                 off = np.linalg.norm(frame.bearings[i, there] - rays[there], axis=-1)
                 assert np.degrees(off).max(initial=0.0) < 0.1
         assert frames[-1].pan is None or frames[-1].pan[0] == pytest.approx(pan)
+
+    @pytest.mark.parametrize("pan", [0.0, 0.3])
+    def test_tags_are_drawn_where_the_targets_are(self, monkeypatch: pytest.MonkeyPatch, pan: float) -> None:
+        drawn: list[list[PlacedTag]] = []
+
+        def kept(renderer: FrameRenderer, tags: list[PlacedTag], *shades: Any) -> np.ndarray:
+            drawn.append(tags)
+            return render(renderer, tags, *shades)
+
+        render = FrameRenderer.render
+        monkeypatch.setattr(FrameRenderer, "render", kept)
+        turning = {"action": {"pan": {"limit": 0.5, "rate": 1.0}}} if pan else {}
+        scenario = yard(IN_VIEW, map={"origin": [1.0, 2.0, 0.5]}, **turning)
+        frame = ticks(scenario, 6, pan, speed=0.3)[-1]
+        assert frame.truth is not None and [tag.number for tag in drawn[-2]] == [0, 1, 2, 4]
+        (R, *_), (p, *_) = frame.truth.rotation, frame.truth.position
+        places = np.concatenate([frame.landmarks, frame.truth.position[1:] + scenario.vehicles[1].marker])
+        angle = 0.0 if frame.pan is None else frame.pan[0]
+        turned = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
+        optical = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # x right, y down, z forward
+        offsets = ((places - p) @ R - CAMERA["position"]) @ turned @ optical.T
+        assert np.allclose([tag.place for tag in drawn[-2]], offsets, rtol=0.0, atol=1e-6)
+        assert all(tag.side == 0.4 for tag in drawn[-2]) and np.ptp(np.linalg.norm(offsets, axis=1)) > 1.0
+        for tag in drawn[-2]:  # upright, and towards the camera
+            assert np.allclose(tag.axes[:, 1], [0, 1, 0]) and abs(tag.axes[:, 0] @ tag.place) < 1e-9
+            assert np.linalg.det(tag.axes) == pytest.approx(1.0) and tag.axes[:, 2] @ tag.place > 0.0
+
+    @pytest.mark.parametrize("x", [-2.2, -1.9, -1.1, 0.0, 0.8, 2.0])
+    @pytest.mark.parametrize("y", [-1.5, 0.1, 1.55])
+    def test_a_tag_is_painted_whole_up_to_the_edges_of_the_image(
+        self, monkeypatch: pytest.MonkeyPatch, x: float, y: float
+    ) -> None:
+        renderer = FrameRenderer(Calibration.of(yard(IN_VIEW).cameras[0]), "tag16h5")
+        tag = facing(3, np.array([x, y, 3.0]), 0.7)
+
+        def frame() -> np.ndarray:
+            return renderer.render([tag], 0.0, 0.0, np.random.default_rng(0))
+
+        painted = frame()
+        monkeypatch.setattr(renderer, "_box", lambda *_: (slice(0, 240), slice(0, 320)))
+        assert np.array_equal(painted, frame())
+
+    def test_a_family_may_have_exactly_as_many_tags_as_there_are_targets(self) -> None:
+        simulation_of(yard({f"m{n}": [4.0, 0.1 * n, 0.5] for n in range(28)}))
 
     def test_a_tag_outside_the_image_or_unreadable_is_missed(self) -> None:
         assert not any(frame.visible.any() for frame in ticks(yard(IN_VIEW, images={"blur": 12.0}), 3))

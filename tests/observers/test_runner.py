@@ -178,6 +178,7 @@ class UnspeakableError(Exception):
     ("change", "said"),
     [
         (lambda e: sys.exit(3), "SystemExit: 3"),
+        (lambda e: (_ for _ in ()).throw(BaseException("odd")), "BaseException: odd"),
         (lambda e: (_ for _ in ()).throw(ValueError("one\nand two")), "ValueError: one and two"),
         (lambda e: None, "update returned None, expected an Estimate"),
         (lambda e: (e.rotation, e.position), "update returned (array("),

@@ -463,3 +463,52 @@ def test_discs_cover_a_long_car() -> None:
         edge = np.linspace(-length / 2, length / 2, 101)
         far = np.hypot(edge[:, None] - centres, width / 2).min(axis=1)
         assert far.max() <= np.hypot(length / len(centres), width) / 2 + 1e-9
+
+
+def test_boxes_below_the_camera_hide_nothing_and_others_are_where_they_stand() -> None:
+    """A camera at 0.4 m, landmarks at 2.4 m: a box up to 1.4 m is above half of every line of sight."""
+    house = {"yaw": 0.5, "size": [2.0, 1.0, 0.2]}
+    low, level, tall, towering = (
+        {**house, "name": f"top_{top}", "center": [40.0, 1.0 + 9 * n, top - 0.1]}
+        for n, top in enumerate((0.3, 0.4, 1.4, 9.0))
+    )
+    scenario = square(
+        **{
+            "obstacles": [low, level, tall, towering],
+            "camera.position": [0.1, 0.0, 0.4],
+            "landmarks.*.position": [5.0, 5.0, 2.4],
+            "vehicles.*.body": {"size": [1.0, 0.5, 1.8], "center": [0.25, 0.1, 0.0]},
+            "map.origin": [1.0, 2.0, 0.0],
+        }
+    )
+    ahead = np.array([0.6, 0.8, 0.0])
+    row = observation(
+        scenario,
+        estimate_position=(0.5, -1.0, 0.0),
+        estimate_forward=ahead,
+        message_position=[(2.0, 0.0, 0.0)] * 3,
+        message_forward=[(0.0, 2.0, 0.0)] * 3,
+        message_mask=[1, 0, 0],
+    )
+    layout = observation_layout(scenario)
+    boxes = Occluders(scenario, layout).boxes(lambda name: layout[name].values(row))
+    assert [box.below for box in boxes] == pytest.approx([0.25, 0.5, 1.0])  # vehicle, tall, towering
+    assert [box.moves for box in boxes] == [True, False, False]
+    assert [box.half for box in boxes] == [(0.5, 0.25), (1.0, 0.5), (1.0, 0.5)]
+    vehicle, *houses = boxes
+    assert vehicle.forward[0] == pytest.approx([0.0, 1.0]) and vehicle.center[0] == pytest.approx([1.9, 0.25])
+    turn = np.array([[0.6, 0.8], [-0.8, 0.6]])
+    for box, y in zip(houses, (19.0, 28.0), strict=True):
+        assert box.center[0] == pytest.approx(turn @ (40.0 - 1.0 - 0.5, y - 2.0 + 1.0), abs=1e-5)
+        assert box.forward[0] == pytest.approx(turn @ (math.cos(0.5), math.sin(0.5)), abs=1e-6)
+
+
+def test_a_field_of_view_ends_short_of_the_edges_of_the_image() -> None:
+    lens = {"model": "pinhole", "image_size": [640, 300], "principal_point": [300.0, 170.0], "range": 8.0}
+    camera = square(
+        **{f"camera.{key}": value for key, value in {**lens, "focal_length": [400.0, 250.0]}.items()}
+    ).camera
+    view, margin = FieldOfView(camera), math.radians(1.5)
+    assert view.left == pytest.approx(math.atan(300.0 / 400.0) - margin, abs=1e-12)
+    assert view.right == pytest.approx(-math.atan(340.0 / 400.0) + margin, abs=1e-12)
+    assert view.reach == pytest.approx(0.95 * 8.0) and view.ahead == camera.position[0]

@@ -5,16 +5,23 @@ from __future__ import annotations
 import io
 import json
 import shutil
+import sys
 import tracemalloc
 import zipfile
 from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import replace
 from hashlib import sha256
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from coopenv.base import installation
+from coopenv.base.errors import DataError
 from coopenv.cli.app import main
+from coopenv.runs.bundle import Bundle
 from tests.helpers.commands import refused
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -142,6 +149,140 @@ def test_code_that_a_scenario_names_runs_from_the_current_folder_only(
     with (own / "lane_terms.py").open("a") as file:
         file.write("# changed\n")
     assert needed in refused("run", "../own.zip")
+
+
+EVIL = "open('ran', 'w').close()\n\nclass X:\n    pass\n\ndef x(ego):\n    return 0.0\n"
+
+
+def changed(name: str, *keys: str, value: object) -> Callable[[dict[str, bytes]], None]:
+    """Return a change of an entry of a part in JSON."""
+
+    def change(parts: dict[str, bytes]) -> None:
+        node = whole = json.loads(parts[name])
+        for key in keys[:-1]:
+            node = node.setdefault(key, {})
+        node[keys[-1]] = value
+        parts[name] = json.dumps(whole).encode()
+
+    return change
+
+
+SCENARIO, MANIFEST = "scenario.json", "manifest.json"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (changed(MANIFEST, "observer", value="evil.py:X"), "names 'evil.py:X' without the digest of a file"),
+        (changed(MANIFEST, "observer", value="../evil.py:X"), "names '../evil.py:X' without the digest of a file"),
+        (changed(MANIFEST, "observer", value="evil:X"), "names 'evil:X' without the digest of a file"),
+        (changed(SCENARIO, "observer", "name", value="evil.py:X"), "observer.name: String should match pattern"),
+        *(
+            (changed(SCENARIO, part, "custom", value={"e": row}), "names 'evil.py:x' without the digest of a file")
+            for part in ("reward", "termination", "observation")
+            for row in ("evil.py:x", {"function": "evil.py:x"})
+        ),
+        (changed(SCENARIO, "program", value={"code": "evil.py:X"}), "names 'evil.py:X' without the digest of a file"),
+        (changed(SCENARIO, "program", value={"code": "os:system"}), "names 'os:system' without the digest of a file"),
+        (changed(SCENARIO, "sumo", value={"net": "evil.py"}), "names 'evil.py' without the digest of a file"),
+        (changed(SCENARIO, "sumo", value={"net": "a.xml", "routes": ["evil.py"]}), "'a.xml' without the digest"),
+        (changed(SCENARIO, "sumo", value={"net": "sumo_crossing.net.xml", "options": {"log": "a"}}), "can write files"),
+        (
+            changed(SCENARIO, "highway", value={"id": "a-v0", "config": {"other_vehicles_type": "evil.X"}}),
+            "highway.config.other_vehicles_type: names code: 'evil.X'",
+        ),
+    ],
+)
+def test_code_and_files_without_a_digest_are_neither_run_nor_read(
+    folder: Path, bundled: Path, change: Callable[[dict[str, bytes]], None], words: str
+) -> None:
+    (folder / "evil.py").write_text(EVIL)
+    assert words in refused("run", edited(bundled, change))
+    assert not (folder / "ran").exists()
+
+
+@pytest.fixture(scope="module")
+def bundled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a bundle of a short run."""
+    folder = tmp_path_factory.mktemp("bundled")
+    assert (
+        main(["run", "facade", "--no-figures", "--policy", "peek", "--steps", "2", "--out", str(folder / "run")]) == 0
+    )
+    assert main(["bundle", str(folder / "run"), "--out", str(folder / "run.zip")]) == 0
+    return folder / "run.zip"
+
+
+def test_modules_that_code_imports_from_the_folder_need_digests_of_the_archive(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "mine.py").write_text(
+        "import beside_mine\n" + OBSERVER.replace("VERDICT", "pass").replace("Late", "Beside")
+    )
+    (folder / "beside_mine.py").write_text("")
+    assert main(run("--steps", "2", "--observer", "mine.py:Beside")) == 0 and main(["bundle", "run"]) == 0
+    with zipfile.ZipFile("run.zip") as archive:
+        assert {"code/mine.py", "code/beside_mine.py"} <= {*archive.namelist()}
+    capsys.readouterr()
+    for content, same in (("", True), (EVIL, False)):
+        (folder / "beside_mine.py").write_text(content)
+        sys.modules.pop("beside_mine")
+        for name in [name for name in sys.modules if name.endswith("_mine")]:
+            del sys.modules[name]
+        installation._module_of.cache_clear()
+        if same:
+            assert main(["run", "run.zip"]) == 0 and capsys.readouterr().out.endswith("The same figures.\n")
+        else:
+            line = refused("run", "run.zip")
+            assert "cannot be loaded: ImportError: beside_mine of the current folder: no digest of it is stated" in line
+    assert not (folder / "ran").exists()
+
+
+@pytest.mark.parametrize("place", ["evil.py", "evil/__init__.py", "evil/inner.py"])
+def test_only_vouched_modules_of_a_folder_are_imported(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    monkeypatch.syspath_prepend(str(folder))
+    (folder / place).parent.mkdir(exist_ok=True)
+    (folder / place).write_text(EVIL)
+    (folder / "sound.py").write_text("value = 3\n")
+    (folder / "xml").mkdir()  # a folder without code hides no module
+    digests = {"code/sound.py": sha256((folder / "sound.py").read_bytes()).hexdigest()}
+    with installation.importing_vouched(folder, digests):
+        assert import_module("sound").value == 3 and import_module("xml.dom").__name__ == "xml.dom"
+        with pytest.raises(ImportError, match="evil of the current folder: no digest of it is stated"):
+            import_module("evil.inner" if "inner" in place else "evil")
+    del sys.modules["sound"]
+    assert not (folder / "ran").exists()
+
+
+def test_files_of_simulators_are_read_with_their_digests_only(folder: Path, bundled: Path) -> None:
+    (folder / "own.net.xml").write_text("<net/>")
+    code: dict[str, Path] = {}
+    assert installation.beside("own.net.xml", folder, code) == "own.net.xml"
+    assert code == {"own.net.xml": folder / "own.net.xml"}
+    found = Bundle.read(bundled)
+    for digest, words in ((installation.file_digest(code["own.net.xml"]), ""), ("0" * 64, "needs own.net.xml here")):
+        parts = found.manifest.parts | {"code/own.net.xml": digest}
+        stating = replace(found, manifest=found.manifest.model_copy(update={"parts": parts}))
+        with nullcontext() if not words else pytest.raises(DataError, match=words):
+            assert stating._here("elsewhere/own.net.xml", Path()) == str(folder / "own.net.xml")
+    shipped = installation.data_directory("envs") / "sumo_crossing.net.xml"
+    assert found._here("sumo_crossing.net.xml", Path()) == str(shipped)
+
+
+def test_long_names_of_a_bundle_are_shortened(folder: Path, bundled: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    many = changed(MANIFEST, "environment", value="A" * 5000)
+    versions = changed(MANIFEST, "versions", value={"coopenv": "B" * 5000})
+
+    def both(parts: dict[str, bytes]) -> None:
+        many(parts)
+        versions(parts)
+
+    file = edited(bundled, both)
+    capsys.readouterr()
+    assert main(["run", file]) == 0
+    printed = capsys.readouterr()
+    assert "AAA...AAA" in printed.out and "BBB...BBB" in printed.err and len(printed.out + printed.err) < 800
 
 
 def test_a_driver_that_a_scenario_names_is_replayed_without_its_code(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from coopenv.api.engine import Engine
+from coopenv.base.errors import CoopenvError
 from coopenv.world import launch
 from coopenv.world.launch import threads_and_lanes
 from coopenv.world.step import follow_kernels
@@ -128,3 +129,11 @@ def test_cores_are_used_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
     assert threads_and_lanes(1, 1024, "cpu") == (1, 4)
     assert threads_and_lanes(64, 5, "cpu") == (2, 1)
     assert threads_and_lanes(128, 1024, "cpu") == (4, 1)
+
+
+@pytest.mark.parametrize("wanted", ["0", "-1", "1025", "100000", "9" * 5000, "two", "4.0"])
+def test_a_number_of_threads_that_no_machine_has_is_refused(monkeypatch: pytest.MonkeyPatch, wanted: str) -> None:
+    monkeypatch.setenv("COOPENV_THREADS", wanted)
+    with pytest.raises(CoopenvError, match="COOPENV_THREADS must be a whole number from 1 to 1024, got ") as caught:
+        threads_and_lanes(1, 1024, "cpu")
+    assert len(str(caught.value)) < 150

@@ -12,8 +12,11 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import Outcome
+from coopenv.scenario.learning import FASTEST_PACE
 from coopenv.scenario.routes import Boxes
 from coopenv.world import dynamics
+from coopenv.world.build import _motion
+from coopenv.world.model import PRESCRIBED, STATIC
 from tests.helpers.builders import command, constant, landmark, reset, run, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES, Calls
 from tests.scenario.test_routes import depth as overlap
@@ -290,3 +293,22 @@ def test_reset_clears_the_end() -> None:
     assert world.get_state()["ended"][0, 0] == Outcome.UNDER_WAY
     world.advance(120)
     assert world.get_state()["ended"][0, 0] == Outcome.ARRIVED
+
+
+@pytest.mark.parametrize(("spread", "pace"), [(0.0, 1.0), (0.1, 2.0 * FASTEST_PACE)])
+def test_prepared_motions_last_one_frame_beyond_the_horizon(spread: float, pace: float) -> None:
+    """A longer pace takes the motion's table farther; the frame beyond it is that of the last tick."""
+    points = [{"time": float(t), "position": [0.1 * t, 0.0, 0.0]} for t in range(60)]
+    moving = {"motion": {"kind": "waypoints", "waypoints": points}, "pace_spread": spread}
+    segments = {"kind": "segments", "segments": [{"duration": 1.0, "linear": [n, 0.0, 0.0]} for n in range(9)]}
+    walker = landmark("walker", (5.0, 5.0, 1.0), motion=segments)
+    marks = [landmark(f"m{n}", (n, 9.0, 1.0)) for n in range(3)]
+    made = scenario([moving], horizon=4.0, rates={"camera": 25.0, "decision": 5.0}, landmarks=[*marks, walker])
+    found = _motion(made)
+    until = (4.0 + 1.0 / 25.0) * pace
+    assert found["kind"] == [STATIC] * 3 + [PRESCRIBED] * 2
+    assert found["start"][-1] == pytest.approx(min(until, 59.0), abs=1e-12)
+    begun = [float(t) for t in range(10) if t <= until]
+    first, last = found["first"][3:5]
+    assert found["start"][first:last].tolist() == begun
+    assert found["linear"][first:last, 0].tolist() == [*(float(n) for n in range(9)), 0.0][: len(begun)]

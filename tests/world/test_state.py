@@ -317,6 +317,21 @@ def test_states_of_plug_ins(observers: Any, why: str) -> None:
     assert same(before, env.get_state())
 
 
+@pytest.mark.parametrize("name", ["mekf", "covariance_intersection", "centralised"])
+def test_damaged_observers_of_this_package_are_refused(name: str) -> None:
+    env = coopenv.parallel_env("busy_intersection_tracking", observer=name)
+    env.reset(seed=0)
+    env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
+    before = env.get_state()
+    env.set_state(before)
+    assert same(before, env.get_state())
+    state = env.get_state()
+    setattr(state["observers"][0]["observers"][0], "poses" if name == "centralised" else "state", None)
+    with pytest.raises(CoopenvError, match="state: the observers do not fit: "):
+        env.set_state(state)
+    assert same(before, env.get_state())
+
+
 def test_messages_of_plug_ins() -> None:
     env = coopenv.parallel_env("busy_intersection_tracking", observer="mekf")
     env.reset(seed=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coopenv import CoopenvError
+from coopenv.cars import vision
 from coopenv.cars.bags.bag import Bag
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topics import examined, proposed
@@ -154,7 +156,7 @@ def test_what_is_wrong_is_one_line() -> None:
         VisionSettings(family="tag36h12")
     with pytest.raises(CoopenvError, match="encoding: 'yuv444' is none of mono8"):
         frame_of(make("sensor_msgs/msg/Image", width=1, height=1, step=1, encoding="yuv444", data=[0]))
-    with pytest.raises(CoopenvError, match="no image that OpenCV reads"):
+    with pytest.raises(CoopenvError, match="no JPEG or PNG image that OpenCV reads"):
         frame_of(make("sensor_msgs/msg/CompressedImage", format="jpeg", data=[1, 2, 3]))
     odd = {"width": 63, "height": 48, "step": 126, "encoding": "yuv422", "data": np.zeros(126 * 48, np.uint8)}
     with pytest.raises(CoopenvError, match=r"detections: data: OpenCV does not read 63 x 48 yuv422: ") as caught:
@@ -164,3 +166,30 @@ def test_what_is_wrong_is_one_line() -> None:
         )
         read(Role.DETECTIONS, make("sensor_msgs/msg/Image", **odd), camera, vision=settings)
     assert "\n" not in str(caught.value)
+
+
+OTHERS = (".bmp", ".tiff", ".webp", ".jp2", ".hdr", ".sr", ".gif")
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", *OTHERS])
+def test_compressed_frames_are_jpeg_or_png_and_damaged_ones_are_quiet(
+    capfd: pytest.CaptureFixture[str], suffix: str
+) -> None:
+    cv2, rng = vision.opencv(), np.random.default_rng(0)
+    frame = cv2.cvtColor(rng.integers(0, 255, (40, 60), dtype=np.uint8), cv2.COLOR_GRAY2BGR)
+    try:
+        data = cv2.imencode(suffix, frame.astype(np.float32) if suffix == ".hdr" else frame)[1].ravel()
+    except cv2.error:
+        pytest.skip("this OpenCV does not write it")
+    capfd.readouterr()
+    message = make("sensor_msgs/msg/CompressedImage", format=suffix, data=data)
+    if suffix in (".jpg", ".png"):
+        assert frame_of(message).shape == (40, 60)
+        for cut in range(20, len(data), 97):
+            for broken in (data[:cut], np.where(np.arange(len(data)) % 97 == cut % 97, 0x55, data).astype(np.uint8)):
+                with suppress(CoopenvError):
+                    frame_of(make("sensor_msgs/msg/CompressedImage", format=suffix, data=broken))
+    else:
+        with pytest.raises(CoopenvError, match=r"data: no JPEG or PNG image that OpenCV reads, its format is '\.\w+'"):
+            frame_of(message)
+    assert capfd.readouterr() == ("", "")
