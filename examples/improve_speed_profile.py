@@ -7,9 +7,9 @@ Run: python examples/improve_speed_profile.py (about two minutes)
 from pathlib import Path
 
 import numpy as np
+from differentiable import DifferentiableWorld
 
 import coopenv
-from coopenv.observers.riccati_gradient import DifferentiableWorld
 
 overrides = {
     "noise.enabled": False,

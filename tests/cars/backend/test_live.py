@@ -397,8 +397,6 @@ def test_a_gyro_that_sends_zeros_stops_the_cars_and_keeps_them_from_arming(
     with closing(env_of(cars(path, hub))) as env:
         env.reset(seed=3, options={"arm": True})
         stopped = drive(env, 100, turn)["vehicle_1"]["car"]["stopped"]
-        assert re.search(
-            r"svea\d: its turn rate is 0 rad/s in all \d+ messages, while .* turns? it by ", stopped
-        )
+        assert re.search(r"svea\d: its turn rate is 0 rad/s in all \d+ messages, while .* turns? it by ", stopped)
         with pytest.raises(CoopenvError, match=r"not armed: svea\d: its turn rate is 0 rad/s"):
             env.reset(options={"arm": True})

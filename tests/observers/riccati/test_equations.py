@@ -18,8 +18,8 @@ import coopenv
 from coopenv.base.errors import world_keys
 from coopenv.estimation import linalg
 from coopenv.observers import riccati as kernels
-from coopenv.observers.riccati_gradient import DifferentiableWorld, check_differentiable, tick_intervals
 from coopenv.scenario import Scenario
+from examples.differentiable import DifferentiableWorld, check_differentiable, tick_intervals
 from tests.helpers.builders import simulate
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.warp_calls import Calls
