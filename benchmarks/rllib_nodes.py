@@ -22,9 +22,9 @@ import torch
 from ray.cluster_utils import Cluster
 from ray.rllib.algorithms.ppo import PPOConfig
 from rich.console import Console
+from rllib_env import CooperativeRows
 
 from benchmarks.machine import machine
-from coopenv.api.trainers.rllib import CooperativeRows
 from coopenv.runs.console import number_table
 
 NODES = (1, 2)

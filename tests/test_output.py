@@ -309,9 +309,9 @@ def test_one_line_names_the_extra(command: str, done: dict[str, tuple[int, str, 
     ("module", "needed", "extra"),
     [
         ("coopenv.api.trainers.sb3", "stable_baselines3.common.vec_env", "train"),
-        ("coopenv.api.trainers.rllib", "ray.rllib.env.multi_agent_env", "rllib"),
-        ("coopenv.api.trainers.torchrl", "torchrl.envs", "torchrl"),
-        ("coopenv.api.trainers.benchmarl", "benchmarl.environments.vmas.common", "benchmarl"),
+        ("rllib_env", "ray.rllib.env.multi_agent_env", "rllib"),
+        ("torchrl_env", "torchrl.envs", "torchrl"),
+        ("benchmarl_task", "benchmarl.environments.vmas.common", "benchmarl"),
     ],
 )
 def test_missing_extra(module: str, needed: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:

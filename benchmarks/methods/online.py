@@ -13,6 +13,7 @@ from benchmarl.algorithms import IppoConfig, MappoConfig
 from benchmarl.experiment import Experiment, ExperimentConfig
 from benchmarl.models import GnnConfig, SequenceModelConfig
 from benchmarl.models.mlp import MlpConfig
+from benchmarl_task import task
 from sb3_contrib import RecurrentPPO
 from sb3_contrib.common.recurrent.buffers import RecurrentRolloutBuffer
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
@@ -20,11 +21,10 @@ from sb3_contrib.common.recurrent.type_aliases import RecurrentRolloutBufferSamp
 from tensordict import TensorDict
 from torch_geometric.nn.conv import GraphConv
 from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl_env import GROUP
 
 from coopenv.api.engine import Engine
-from coopenv.api.trainers.benchmarl import task
 from coopenv.api.trainers.sb3 import CooperativeSB3VecEnv
-from coopenv.api.trainers.torchrl import GROUP
 from coopenv.base.sections import Section
 from coopenv.policies import Policy
 from coopenv.training.command import possible

@@ -15,8 +15,8 @@ from benchmarl.algorithms import IppoConfig, MaddpgConfig, MappoConfig
 from benchmarl.experiment import Callback, Experiment, ExperimentConfig
 from benchmarl.models import GruConfig
 from benchmarl.models.mlp import MlpConfig
+from benchmarl_task import task
 
-from coopenv.api.trainers.benchmarl import task
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = [pytest.mark.benchmarl, pytest.mark.filterwarnings("ignore")]

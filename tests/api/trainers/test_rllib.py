@@ -14,8 +14,8 @@ import ray
 import torch
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.env.multi_agent_env_runner import MultiAgentEnvRunner
+from rllib_env import CooperativeMultiAgentEnv
 
-from coopenv.api.trainers.rllib import CooperativeMultiAgentEnv
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.rllib

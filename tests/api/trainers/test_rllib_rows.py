@@ -15,9 +15,9 @@ import torch
 from ray.cluster_utils import Cluster
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
+from rllib_env import CooperativeRows
 
 import coopenv
-from coopenv.api.trainers.rllib import CooperativeRows
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.rllib

@@ -21,10 +21,10 @@ from torchrl.envs.utils import check_env_specs
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
+from torchrl_env import batched_env
 
 import coopenv
 from coopenv.api.parallel_env import PlainInfos
-from coopenv.api.trainers.torchrl import batched_env
 from coopenv.api.vector_env import TrueEnds
 from tests.helpers.four_way import FOUR_WAY
 

@@ -1,4 +1,7 @@
-"""TorchRL: a batch of worlds as one environment with a group of agents. Needs the extra `torchrl` or `benchmarl`."""
+"""TorchRL: a batch of worlds as one environment with a group of agents. Needs the extra `torchrl` or `benchmarl`.
+
+Copy this file beside your program; docs/trainers.md has one.
+"""
 
 from typing import Any
 
@@ -18,7 +21,7 @@ try:
     from torchrl.data import Bounded, Categorical, Composite, Unbounded
     from torchrl.envs import EnvBase
 except ImportError as error:
-    raise ImportError(f"coopenv.api.trainers.torchrl needs TorchRL: {install_command('torchrl')}") from error
+    raise ImportError(f"{__name__} needs TorchRL: {install_command('torchrl')}") from error
 
 GROUP = "vehicle"
 QUALITIES = ("position_error", "orientation_error", "nees")

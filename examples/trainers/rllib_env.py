@@ -1,4 +1,7 @@
-"""RLlib, new API stack: one world as a `MultiAgentEnv`, or a batch as rows for one policy. Needs the extra `rllib`."""
+"""RLlib, new API stack: one world as a `MultiAgentEnv`, or a batch as rows for one policy. Needs the extra `rllib`.
+
+Copy this file beside your program; docs/trainers.md has one.
+"""
 
 from typing import Any
 
@@ -15,7 +18,7 @@ from coopenv.base.installation import install_command
 try:
     from ray.rllib.env.multi_agent_env import MultiAgentEnv
 except ImportError as error:
-    raise ImportError(f"coopenv.api.trainers.rllib needs RLlib: {install_command('rllib')}") from error
+    raise ImportError(f"{__name__} needs RLlib: {install_command('rllib')}") from error
 
 
 class CooperativeMultiAgentEnv(MultiAgentEnv):

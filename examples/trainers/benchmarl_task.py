@@ -1,4 +1,7 @@
-"""BenchMARL: every environment as a task, batched. Needs the extra `benchmarl`."""
+"""BenchMARL: every environment as a task, batched. Needs the extra `benchmarl`.
+
+Copy this file and `torchrl_env.py` beside your program; docs/trainers.md has one.
+"""
 
 from typing import Any
 
@@ -10,10 +13,9 @@ try:
     from tensordict import TensorDictBase
     from torchrl.data import Composite
     from torchrl.envs import EnvBase, Transform
-
-    from coopenv.api.trainers.torchrl import EVENTS, GROUP, QUALITIES, batched_env
+    from torchrl_env import EVENTS, GROUP, QUALITIES, batched_env
 except ImportError as error:
-    raise ImportError(f"coopenv.api.trainers.benchmarl needs BenchMARL: {install_command('benchmarl')}") from error
+    raise ImportError(f"{__name__} needs BenchMARL: {install_command('benchmarl')}") from error
 
 
 class ActingLosses(Transform):
