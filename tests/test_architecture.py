@@ -92,24 +92,24 @@ def test_a_class_name_means_one_class() -> None:
 
 LINES_AND_FILES = {
     ".": (129, 2),
-    "api": (4401, 19),
-    "backends": (4019, 15),
-    "base": (1950, 10),
+    "api": (4118, 16),
+    "backends": (4062, 15),
+    "base": (2103, 10),
     "bench": (5554, 18),
-    "cars": (11367, 43),
-    "cli": (2719, 9),
+    "cars": (12011, 48),
+    "cli": (2734, 9),
     "estimation": (1917, 7),
     "evaluation": (492, 3),
-    "observers": (12010, 43),
-    "policies": (2077, 10),
-    "runs": (3573, 13),
-    "scenario": (3825, 12),
-    "training": (1612, 6),
+    "observers": (11661, 42),
+    "policies": (2081, 10),
+    "runs": (3608, 13),
+    "scenario": (3983, 13),
+    "training": (1587, 6),
     "viz": (4887, 16),
-    "world": (5626, 18),
+    "world": (5634, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
-MOST_FILES = 244
+MOST_FILES = 246
 
 
 def test_wings_keep_their_budgets() -> None:

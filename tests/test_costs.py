@@ -209,6 +209,44 @@ def bag(form: str) -> Callable[[int, Path], Work]:
     return make
 
 
+def channels(n: int, folder: Path) -> Work:
+    pytest.importorskip("rosbags", reason="needs the extra 'log'")
+    from mcap.writer import Writer
+
+    from coopenv.cars.bags.files import BagFile
+
+    path = folder / "topics.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="test")
+        kind = writer.register_schema("std_msgs/msg/Header", "ros2msg", b"string frame_id\n")
+        for i in range(n):
+            writer.register_channel(f"/t{i}", "cdr", kind)
+        writer.finish()
+    return lambda: BagFile(path).times()
+
+
+def definition(text: Callable[[int], str]) -> Callable[[int, Path], Work]:
+    def make(n: int, folder: Path) -> Work:
+        pytest.importorskip("rosbags", reason="needs the extra 'log'")
+        from coopenv.cars.bags.definitions import BagChannel, _store, decode
+
+        channel = BagChannel("/t", "x/msg/M", "cdr", "ros2msg", text(n))
+
+        def read() -> None:
+            _store.cache_clear()
+            decode(channel, bytes(4))
+
+        return read
+
+    return make
+
+
+def levels(n: int) -> str:
+    names = "".join("=" * 80 + f"\nMSG: x/A{k}\nx/A{k + 1} a\nx/A{k + 1} b\n" for k in range(n))
+    return f"x/A0 a\n{names}" + "=" * 80 + f"\nMSG: x/A{n}\nuint8 x\n"
+
+
 def payload(n: int, folder: Path) -> Work:
     codec = pytest.importorskip("coopenv.cars.codec", reason="needs the extra 'svea'")
     one = "pixy_camera/msg/ObjectBearing"
@@ -299,6 +337,9 @@ ROWS = (
     Row("bag of ROS 1", "messages", 1, bag("ros1"), 15),
     Row("bag of ROS 2, SQLite", "messages", 1, bag("sqlite3"), 15),
     Row("bag of ROS 2, MCAP", "messages", 1, bag("mcap"), 15),
+    Row("bag: topics", "topics", 1, channels, 50),
+    Row("bag: fields of a type", "bytes", 1, definition(lambda n: "string[900] a\n" + "uint8 x\n" * n), 50, True),
+    Row("bag: types in types", "bytes", 1, definition(levels), 15, refused=True),
     Row("message of a car (CDR)", "entries", 1, payload, 50),
     Row("image", "pixels", 1, image("mono8"), 200),
     Row("image, PNG", "pixels", 1, image("png"), 200),
