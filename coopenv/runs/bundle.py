@@ -37,6 +37,7 @@ from coopenv.observers.registry import named, portable
 from coopenv.runs.rollouts import Rollout
 from coopenv.scenario import load_scenario, parse_scenario
 from coopenv.scenario.own_terms import located
+from coopenv.scenario.sumo_files import TRAFFIC_OPTIONS
 from coopenv.world.warp_internals import kernel_hashes
 
 RECORD_FILE = "record.zip"
@@ -274,7 +275,8 @@ class Bundle:
     def _check_options(self, raw: Mapping[str, Any]) -> None:
         """Refuse options with which another simulator would write files or import code."""
         sumo, highway = raw.get("sumo"), raw.get("highway")
-        if isinstance(sumo, dict) and sumo.get("options"):
+        options = sumo.get("options") if isinstance(sumo, dict) else None
+        if options and not (isinstance(options, dict) and options.keys() <= {*TRAFFIC_OPTIONS}):
             raise DataError(f"{self.path}: scenario.json: sumo.options: can write files, so it is not replayed")
         config = highway.get("config") if isinstance(highway, dict) else None
         for key, value in config.items() if isinstance(config, dict) else ():
