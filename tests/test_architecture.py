@@ -102,7 +102,7 @@ LINES_AND_FILES = {
     "evaluation": (492, 3),
     "observers": (11661, 42),
     "policies": (2081, 10),
-    "runs": (3608, 13),
+    "runs": (3610, 13),
     "scenario": (3983, 13),
     "training": (1587, 6),
     "viz": (4887, 16),

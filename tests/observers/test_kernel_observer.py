@@ -403,7 +403,7 @@ def test_warp_starts_without_its_banner_before_an_observer_on_the_host(monkeypat
     assert called[:2] == ["start", "model"]
 
 
-SOURCE = (
+GENERATED = (
     "void f(Record var_model)\n{\n    Record var_model = _wp_args->model;\n    wp::address(x, i); wp::index(x, i);\n}"
 )
 
@@ -416,10 +416,10 @@ def test_kernels_and_functions_of_other_modules_have_the_source_that_warp_gives_
     kernel = SimpleNamespace(
         func=function, module=SimpleNamespace(name=module), options={}, adj=SimpleNamespace(args=[])
     )
-    monkeypatch.setattr(warp_internals, "_generate", lambda *_: SOURCE)
-    monkeypatch.setattr(warp_internals, "_generate_function", lambda *_, **given: SOURCE)
+    monkeypatch.setattr(warp_internals, "_generate", lambda *_: GENERATED)
+    monkeypatch.setattr(warp_internals, "_generate_function", lambda *_, **given: GENERATED)
     options = {"enable_backward": False}
     made = warp_internals._kernel_source(kernel, "cpu", options)
     called = warp_internals._function_source(SimpleNamespace(func=function), device="cpu", options=options)
-    assert made == called and (made == SOURCE) == (module == "users_own")
+    assert made == called and (made == GENERATED) == (module == "users_own")
     assert ("coopenv::element" in made) == (module != "users_own")
