@@ -185,6 +185,8 @@ def test_wheel_contents(wheel: Path) -> None:
     assert agents == {path.name for path in (ROOT / "agents").iterdir() if path.is_dir()}
     assert {"overtaking.toml", "crossing.toml"} <= {Path(n).name for n in names if "data/examples/fleet/" in n}
     assert {"ros1.bag", "mcap.mcap", "topics.toml"} <= {Path(n).name for n in names if "data/examples/bags/" in n}
+    examples = {n.partition("data/examples/")[2] for n in names if "data/examples/" in n}
+    assert {"own_observer.py", "trainers/torchrl_env.py"} <= examples and not any("__" in n for n in examples)
     tops = {Path(n).parts[0] for n in names}
     assert {t for t in tops if not t.endswith(".dist-info")} == {"coopenv"}
     assert "coopenv/py.typed" in names
@@ -201,6 +203,32 @@ def test_the_source_distribution_is_the_repository(tmp_path: Path) -> None:
     tracked = {name for name in run("git", "ls-files", cwd=ROOT).splitlines() if (ROOT / name).exists()}
     assert tracked - names == set()
     assert {name.partition("/")[0] for name in names - tracked} <= {"PKG-INFO", *(n.partition("/")[0] for n in tracked)}
+
+
+@pytest.mark.packaging
+@pytest.mark.slow
+def test_the_commands_of_the_readme_need_no_clone(wheel: Path, tmp_path: Path) -> None:
+    """From the wheel's files, in an empty folder; long commands are shortened."""
+    zipfile.ZipFile(wheel).extractall(tmp_path / "site")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "site")}
+    empty = tmp_path / "empty"
+    empty.mkdir()
+
+    def coopenv(*words: str) -> str:
+        command = [sys.executable, "-P", "-m", "coopenv", *words]
+        done = subprocess.run(command, cwd=empty, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    coopenv("examples")
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    named = {path.partition(":")[0] for path in re.findall(r"examples/[\w./:]+", text)}
+    assert len(named) >= 3 and all((empty / path).exists() for path in named), named
+    (bag,) = re.findall(r"^coopenv (run examples/bags[^#\n]*)", text, re.MULTILINE)
+    assert "vehicle_1" in coopenv(*bag.split(), "--until", "4")
+    (own,) = re.findall(r"^coopenv (bench observers .*own_observer[^#\n]*)", text, re.MULTILINE)
+    coopenv(*own.split(), "--seeds", "1", "--seconds", "3", "--observers", "examples/own_observer.py:Ekf")
+    assert (empty / "out" / "mine").is_dir()
 
 
 @pytest.mark.packaging

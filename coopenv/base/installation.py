@@ -56,11 +56,29 @@ def sample_bags(folder: str | Path = "bags") -> Path:
     Raises:
         OutputError: the folder cannot be written to.
     """
+    return _copied("examples/bags", folder, "make.py")
+
+
+def copy_examples(folder: str | Path = "examples") -> Path:
+    """Copy the examples, programs, scenarios, fleets and bags, to a folder, and return its path.
+
+    Files of these names are replaced.
+
+    Raises:
+        OutputError: the folder cannot be written to.
+    """
+    return _copied("examples", folder, "notebooks")
+
+
+def _copied(name: str, folder: str | Path, left_out: str) -> Path:
     from coopenv.base.files import writing  # `import coopenv` needs no files
 
+    source = data_directory(name)
+    if Path(folder).resolve() == source.resolve():
+        return Path(folder)
     with writing(folder):
-        source, left_out = data_directory("examples/bags"), ignore_patterns("*.py", "__*")
-        return copytree(source, Path(folder), ignore=left_out, copy_function=copyfile, dirs_exist_ok=True)
+        left = ignore_patterns(left_out, "__*")
+        return copytree(source, Path(folder), ignore=left, copy_function=copyfile, dirs_exist_ok=True)
 
 
 def install_command(extra: str) -> str:

@@ -61,6 +61,18 @@ def list_command(
         options.console().print(summary.list_table(rows, summary.COLUMNS[kind]))
 
 
+@app.command(rich_help_panel=LOOK)
+def examples(
+    folder: Annotated[Path, typer.Argument(help="Folder to write, beside other files if it exists.")] = Path(
+        "examples"
+    ),
+) -> None:
+    """Copy the examples: programs, scenarios, fleets of cars and ROS bags."""
+    from coopenv.base.installation import copy_examples
+
+    options.console().print(f"{copy_examples(folder)}: own_observer.py, bags, fleet and more", soft_wrap=True)
+
+
 @dataclass(frozen=True, kw_only=True)
 class DescribeOptions(options.SourceOptions):
     """Options of `coopenv describe`."""
