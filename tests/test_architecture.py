@@ -93,10 +93,10 @@ def test_a_class_name_means_one_class() -> None:
 LINES_AND_FILES = {
     ".": (129, 2),
     "api": (4118, 16),
-    "backends": (4062, 15),
-    "base": (2121, 10),
+    "backends": (4079, 15),
+    "base": (2125, 10),
     "bench": (5554, 18),
-    "cars": (12011, 48),
+    "cars": (12039, 48),
     "cli": (2746, 9),
     "estimation": (1917, 7),
     "evaluation": (492, 3),

@@ -31,15 +31,15 @@ class TooLargeError(ValueError):
 class Allowance:
     """The bytes that a file may still unpack to."""
 
-    def __init__(self, packed: int) -> None:
-        """Begin with that of a file of so many bytes."""
-        self.left = AT_ONCE + EXPANSION * packed
+    def __init__(self, packed: int, expansion: int = EXPANSION) -> None:
+        """Begin with that of a file of so many bytes, which may grow by a factor."""
+        self.left, self._expansion = AT_ONCE + expansion * packed, expansion
 
     def take(self, size: int) -> None:
         """Count bytes that have been unpacked. Raises TooLargeError: there were not so many left."""
         self.left -= size
         if self.left < 0:
-            raise TooLargeError(f"would unpack to more than {EXPANSION} times its size")
+            raise TooLargeError(f"would unpack to more than {self._expansion} times its size")
 
     def unpack(self, compression: str, data: bytes, claimed: int = 0) -> bytes:
         """Return a chunk unpacked, without the memory for more than is allowed.
@@ -86,13 +86,14 @@ KINDS: dict[int, Any] = {
 """Classes of the records that are read as they stand."""
 
 
-def records_of(stream: BinaryIO, most: int, allowance: Allowance | None) -> Iterator[Any]:
+def records_of(stream: BinaryIO, most: int, allowance: Allowance | None, of_others: bool = False) -> Iterator[Any]:
     """Yield the records of a file's data behind its magic, or of a chunk.
 
     Args:
         stream: of the records.
         most: largest length of a record, bytes.
         allowance: what chunks may unpack to, whose records come instead of them; None: they are left out.
+        of_others: of a bag, of which metadata and attachments, and records that make no sense, are left out.
 
     Raises:
         EOFError: it breaks off. Of a chunk in which it does, what there is has been yielded.
@@ -111,11 +112,13 @@ def records_of(stream: BinaryIO, most: int, allowance: Allowance | None) -> Iter
             if whole and chunk.uncompressed_crc not in (0, zlib.crc32(data)):
                 raise ValueError("a chunk is damaged, its check sum differs")
             with nullcontext() if whole else suppress(EOFError, struct.error):
-                yield from records_of(BytesIO(data), len(data), allowance)
+                yield from records_of(BytesIO(data), len(data), allowance, of_others)
             if not whole:
                 raise ValueError(f"a chunk unpacks to {len(data)} bytes, not to the stated {chunk.uncompressed_size}")
         if len(body) < length:
             raise EOFError(CUT_OFF)
+        if of_others and not _sensible(opcode, body):
+            continue
         if opcode == Opcode.MESSAGE:  # the library reads a message number by number, which takes five times as long
             channel, sequence, logged, published = struct.unpack_from("<HIQQ", body)
             yield Message(channel, logged, body[22:], published, sequence)
@@ -125,10 +128,22 @@ def records_of(stream: BinaryIO, most: int, allowance: Allowance | None) -> Iter
             return
 
 
-def messages_of(records: Iterable[Any]) -> Iterator[tuple[Channel, Schema | None, Message | None]]:
+def _sensible(opcode: int, body: bytes) -> bool:
+    """Return whether a record of a bag concerns its messages and can be read."""
+    if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
+        return opcode not in KINDS and (opcode != Opcode.MESSAGE or len(body) >= 22)
+    with suppress(Exception):  # any error of the library at malformed bytes
+        KINDS[opcode].read(ReadDataStream(BytesIO(body)))
+        return True
+    return False
+
+
+def messages_of(
+    records: Iterable[Any], of_others: bool = False
+) -> Iterator[tuple[Channel, Schema | None, Message | None]]:
     """Yield messages in their order, each with its channel and the schema of that; a channel, too, as it is described.
 
-    Raises ValueError: a message has no channel.
+    Raises ValueError: a message has no channel, unless it is that of a bag.
     """
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
@@ -140,6 +155,8 @@ def messages_of(records: Iterable[Any]) -> Iterator[tuple[Channel, Schema | None
             yield record, schemas.get(record.schema_id), None
         elif isinstance(record, Message):
             if record.channel_id not in channels:
+                if of_others:
+                    continue
                 raise ValueError(f"a message's channel {record.channel_id} is not described")
             channel = channels[record.channel_id]
             yield channel, schemas.get(channel.schema_id), record

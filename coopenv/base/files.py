@@ -28,21 +28,25 @@ POLL = 0.02  # s between attempts to lock
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 
 
+_MUTING = threading.RLock()
+
+
 @contextmanager
 def muted_errors() -> Iterator[None]:
-    """Drop what libraries meanwhile write to standard error, past Python."""
-    saved = None
-    with suppress(OSError):  # no standard error: nothing to mute
-        saved = os.dup(2)
-    try:
-        if saved is not None:
-            with Path(os.devnull).open("wb") as nothing:
-                os.dup2(nothing.fileno(), 2)
-        yield
-    finally:
-        if saved is not None:
-            os.dup2(saved, 2)
-            os.close(saved)
+    """Drop what libraries meanwhile write to standard error, past Python; one thread at a time."""
+    with _MUTING:
+        saved = None
+        with suppress(OSError):  # no standard error: nothing to mute
+            saved = os.dup(2)
+        try:
+            if saved is not None:
+                with Path(os.devnull).open("wb") as nothing:
+                    os.dup2(nothing.fileno(), 2)
+            yield
+        finally:
+            if saved is not None:
+                os.dup2(saved, 2)
+                os.close(saved)
 
 
 def lock(folder: Path, wait: float = 0.0, shared: bool = False) -> int | None:

@@ -22,8 +22,8 @@ from coopenv.base.errors import CoopenvError, check_one_of, listed, regular, sho
 CHANGE = "scenario | {'dotted.key': value} returns a changed scenario"
 _METHODS = ("figure", "model_dump", "model_dump_json")
 MOST_BYTES = 4 * 2**20  # of a file; 20,000 landmarks take one or two million
-MOST_KEYS, MOST_PARTS = 200_000, 16
-"""Parts of all keys of a file, of which Python's parser takes up to a kilobyte each, and parts of one dotted key."""
+MOST_KEYS, MOST_PARTS = 120_000, 16
+"""Tables and parts of all keys of a file, some two kilobytes each in Python's parser, and parts of one dotted key."""
 
 
 class Section(BaseModel):
@@ -167,7 +167,7 @@ def toml_of(text: str) -> dict[str, Any]:
         raise ValueError(f"{shown(found[0])}: a dotted key of more than {MOST_PARTS} parts")
     dots = plain.count(".") - sum(1 for _ in _FLOAT.finditer(plain))
     headers = {found[0] for found in _HEADER.finditer(plain)}
-    keys = plain.count("=") + dots + sum(1 + header.count(".") for header in headers)
+    keys = plain.count("=") + plain.count("{") + dots + sum(1 + header.count(".") for header in headers)
     if keys > MOST_KEYS:
         raise ValueError(f"its keys have {keys:,} parts, more than {MOST_KEYS:,}")
     return tomllib.loads(text)

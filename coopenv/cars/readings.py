@@ -242,9 +242,9 @@ def _twist(message: Any) -> Twist:
 
 
 def _velocities(twist: Any) -> Twist:
-    """Return velocities, in which NaN means not measured: a turn rate is unknown, what wheels do not do is 0."""
+    """Return velocities, in which what is not finite is not measured: a turn rate is unknown, the others are 0."""
     linear, angular = ([part.x, part.y, part.z] for part in (twist.linear, twist.angular))
-    linear[1:], angular[:2] = ([0.0 if math.isnan(v) else v for v in some] for some in (linear[1:], angular[:2]))
+    linear[1:], angular[:2] = ([v if math.isfinite(v) else 0.0 for v in some] for some in (linear[1:], angular[:2]))
     known = None if math.isnan(angular[2]) else numbers_of(angular, "twist.angular", SPINNING)
     return Twist(numbers_of(linear, "twist.linear", FASTEST), known)
 
@@ -253,7 +253,9 @@ def _turning(message: Any) -> Twist:
     """Return the turn rate of an Imu; -1 as first covariance means not measured."""
     if float(message.angular_velocity_covariance[0]) == -1.0:
         return Twist(None, None)
-    return Twist(None, vector(message.angular_velocity, "angular_velocity", SPINNING))
+    turning = message.angular_velocity
+    across = [0.0 if math.isnan(value) else value for value in (turning.x, turning.y)]  # as of one axis alone
+    return Twist(None, numbers_of([*across, turning.z], "angular_velocity", SPINNING))
 
 
 def _pose_with_covariance(message: Any) -> CarPose:

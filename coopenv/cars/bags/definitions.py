@@ -107,7 +107,8 @@ def _store(channel: BagChannel) -> tuple[Any, _Cost, str]:
                 store.register({name: known.fielddefs[name] for name in known.fielddefs.keys() - found.keys()})
         return store, _cost(store.fielddefs, kind), ""
     except Exception as error:  # any error of the library at a malformed definition
-        why = f"its definition in the bag is of no use: {error if isinstance(error, CoopenvError) else 'no definition'}"
+        cause = error if isinstance(error, CoopenvError) else "it does not parse"
+        why = f"its definition in the bag is of no use: {cause}"
         if kind not in known.fielddefs:
             raise CoopenvError(f"{kind}: {why}") from None
         return known, _cost(known.fielddefs, kind), f"; {why}" if channel.definition else ""

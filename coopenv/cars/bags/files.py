@@ -37,6 +37,7 @@ REPAIRS = {
 """First bytes of a bag, and the repair tool for one with a truncated recording, by the suffix of the file."""
 
 LATEST = 4 * 10**18  # ns, in 2096: sums of two such times fit into 64 bits
+MOST_DEFINITIONS = 32  # of a topic; each is compiled
 YEAR = 10**9 * 86_400 * 365  # ns
 
 
@@ -58,7 +59,8 @@ class BagFile:
             raise DataError(f"{path}: no bag, expected a folder or one of {', '.join(REPAIRS)}")
         self._stack = ExitStack()
         inside = [path] if path.is_file() else [part for part in sorted(path.iterdir()) if part.is_file()]
-        self._files = [part for part in inside if Path(part.name.removesuffix(PACKED)).suffix in REPAIRS]
+        bags = [part for part in inside if Path(part.name.removesuffix(PACKED)).suffix in REPAIRS]
+        self._files = [part for part in bags if part == path or part.name[0] != "."]
         if not self._files and not any(part.name == METADATA for part in inside):
             raise DataError(f"{path}: a folder without {METADATA}, which a bag of ROS 2 has")
         try:
@@ -70,8 +72,11 @@ class BagFile:
         self.channels = frozenset(channel for channel in counts if channel.readable)
         self.topics: dict[str, str] = {}
         """Type of every topic that can be read; empty where messages of several types came on it."""
-        self.counts = Counter[str]()
+        self.counts, definitions = Counter[str](), Counter[str]()
         for channel in sorted(self.channels):
+            definitions[channel.topic] += 1
+            if definitions[channel.topic] > MOST_DEFINITIONS:
+                raise DataError(f"{path}: {printable(channel.topic)} has over {MOST_DEFINITIONS} types and definitions")
             same = self.topics.get(channel.topic, channel.kind) == channel.kind
             self.topics[channel.topic] = channel.kind if same else ""
             self.counts[channel.topic] += counts[channel]
@@ -165,7 +170,8 @@ class BagFile:
             if part.error is not None:
                 seconds = max(0.0, (part.end_time - part.start_time) * 1e-9)
                 text = f"damaged after {seconds:.1f} s ({error_text(part.error)}); what came before it is used"
-                warnings.warn(f"{self.path}: {text}", DataWarning, stacklevel=3)
+                where = self.path if self.path.is_file() else self.path / part.path.name
+                warnings.warn(f"{where}: {text}", DataWarning, stacklevel=3)
         text = f"left out, since their messages have no encoding of ROS (cdr, ros1): {listed(others)}"
         if others and not self.channels:
             raise DataError(f"{self.path}: no topics of ROS; {text}")

@@ -138,27 +138,30 @@ def value_reader(
 
 
 def _published(files: Sequence[BagFile], chosen: Collection[Chosen], given: TopicMap) -> dict[str, Calibration]:
-    """Return the first calibration of each car that publishes one."""
+    """Return the first usable calibration of each car that publishes one."""
     cars, found = {e.topic: e.car for e in chosen if e.role is Role.CAMERA_INFO}, dict[str, Calibration]()
     for file in files:
-        left = cars.keys() & file.topics.keys()
+        left, why = cars.keys() & file.topics.keys(), dict[str, str]()
         for topic, _, decode in file.messages(frozenset(left)) if left else ():
-            if topic not in left:
-                continue
-            left.remove(topic)
-            try:
-                message = decode()
-                if np.any(getattr(message, "k", getattr(message, "K", 1.0))):
-                    value = read(Role.CAMERA_INFO, message, vision=given.vision)
-                    if isinstance(value, Calibration):
-                        found.setdefault(cars[topic], value)
-                else:
-                    text = f"{file.path}: topic {topic}: says that the camera is not calibrated (k is zero)"
-                    warnings.warn(f"{text}; the environment's calibration counts", DataWarning, stacklevel=4)
-            except CoopenvError as error:
-                raise DataError(f"{file.path}: topic {topic}: {error}") from None
+            if topic in left:
+                try:
+                    message = decode()
+                    if np.any(getattr(message, "k", getattr(message, "K", 1.0))):
+                        value = read(Role.CAMERA_INFO, message, vision=given.vision)
+                        if isinstance(value, Calibration):
+                            found.setdefault(cars[topic], value)
+                        left.remove(topic)
+                    else:
+                        why.setdefault(topic, "")
+                except CoopenvError as error:
+                    why[topic] = why.get(topic) or str(error)
             if not left:
                 break
+        for topic in left & why.keys():
+            if why[topic]:
+                raise DataError(f"{file.path}: topic {topic}: {why[topic]}")
+            text = f"{file.path}: topic {topic}: says that the camera is not calibrated (k is zero)"
+            warnings.warn(f"{text}; the environment's calibration counts", DataWarning, stacklevel=4)
     return found
 
 

@@ -7,6 +7,7 @@ unpacked counts as well. Channels that are not read have no effect on the others
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -23,8 +24,10 @@ ENDS_EARLY = "its end is missing"
 ZSTD = b"\x28\xb5\x2f\xfd"
 """Begin of a packed message; a message of CDR begins with 0."""
 MOST_CHANNELS = 2**16  # as many as an MCAP file has numbers for
-OVERHEAD, IN_MEMORY = 128, 512
-"""Bytes of a file's allowance that a message takes for the time to pass over it, and for the memory once it is read."""
+EXPANSION = {".mcap": 1000, ".db3": 200, ".bag": 200}
+"""Times that a bag may grow when it is unpacked: dark frames and empty maps, which no car needs, pack well."""
+OVERHEAD, IN_MEMORY = 2.5, 10.0
+"""Packed bytes of that allowance which a message takes for the time to pass over it, and for memory once it is read."""
 
 Entries = Iterator[tuple[BagChannel, int, bytes | None]]
 """Messages: channel, time of reception (ns), bytes; None: the channel alone."""
@@ -35,7 +38,7 @@ class Part:
 
     def __init__(self, path: Path) -> None:
         """Go through a file once that ends with .bag, .db3 or .mcap. Raises TooLargeError: it unpacks to too much."""
-        self.path = path
+        self.path, self._growth = path, EXPANSION[path.suffix]
         self.start_time, self.end_time = 2**63 - 1, 0
         self.error: Exception | None = None
         """Why it is read no further than it is."""
@@ -51,18 +54,18 @@ class Part:
 
         Raises TooLargeError: the messages take too much memory.
         """
-        allowance = Allowance(self.path.stat().st_size)
+        allowance, growth = Allowance(self.path.stat().st_size, self._growth), self._growth
         for channel, received, data in self._entries():
             if data is not None and channel in wanted:
-                allowance.take(IN_MEMORY)
+                allowance.take(round(IN_MEMORY * growth))
                 yield channel, received, _unpacked(data, allowance) if data[:4] == ZSTD else data
 
     def _entries(self) -> Entries:
         """Yield messages up to where the file makes no sense."""
-        allowance = Allowance(self.path.stat().st_size)
+        allowance, growth = Allowance(self.path.stat().st_size, self._growth), self._growth
         try:
             for entry in FORMS[self.path.suffix](self.path, allowance):
-                allowance.take(OVERHEAD)
+                allowance.take(round(OVERHEAD * growth))
                 if len(self.counts) > MOST_CHANNELS:
                     raise TooLargeError(f"has more than {MOST_CHANNELS} topics")
                 yield entry
@@ -96,9 +99,9 @@ def _of_mcap(path: Path, allowance: Allowance) -> Entries:
     with regular(path).open("rb") as stream:
         if stream.read(len(MAGIC)) != MAGIC:
             raise ValueError("not an MCAP file")
-        records = records_of(stream, max(container.AT_ONCE, path.stat().st_size), allowance)
+        records = records_of(stream, max(container.AT_ONCE, path.stat().st_size), allowance, of_others=True)
         known: dict[int, BagChannel] = {}
-        for channel, schema, message in messages_of(records):
+        for channel, schema, message in messages_of(records, of_others=True):
             if message is None:
                 name, language, text = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
                 about = channel.topic.encode(), name.encode(), channel.message_encoding, language, text
@@ -141,16 +144,18 @@ def _of_sqlite3(path: Path, allowance: Allowance) -> Entries:
                 raise ValueError(f"{name} is no table")  # but a query, which may have no end
         texts: dict[bytes, tuple[str, bytes]] = {}
         if database.table_exists(None, "message_definitions"):
-            columns = "CAST(topic_type AS BLOB), encoding, CAST(encoded_message_definition AS BLOB)"
+            columns = "CAST(topic_type AS BLOB), CAST(encoding AS BLOB), CAST(encoded_message_definition AS BLOB)"
             rows = database.execute(f"SELECT {columns} FROM message_definitions")
-            texts = {kind: (language, text or b"") for kind, language, text in rows}
+            texts = {kind: ((language or b"").decode(errors="replace"), text or b"") for kind, language, text in rows}
         topics = {}
-        columns = "id, CAST(name AS BLOB), CAST(type AS BLOB), serialization_format"
+        columns = "id, CAST(name AS BLOB), CAST(type AS BLOB), CAST(serialization_format AS BLOB)"
         for key, name, kind, encoding in database.execute(f"SELECT {columns} FROM topics"):
-            topics[key] = _channel(name or b"", kind or b"", encoding, *texts.get(kind, ()))
+            form = (encoding or b"").decode(errors="replace")
+            topics[key] = _channel(name or b"", kind or b"", form, *texts.get(kind, ()))
             yield topics[key], 0, None
         valid = "typeof(data) = 'blob' AND typeof(timestamp) = 'integer'"  # others are damaged
-        query = f"SELECT topic_id, timestamp, data FROM messages WHERE {valid} ORDER BY id"
+        fitting = f"CASE WHEN length(data) <= {container.AT_ONCE} THEN data ELSE x'' END"
+        query = f"SELECT topic_id, timestamp, {fitting} FROM messages WHERE {valid} ORDER BY id"
         for topic, received, data in database.execute(query):
             allowance.take(len(data))
             if topic in topics:
@@ -166,16 +171,17 @@ def _of_ros1(path: Path, allowance: Allowance) -> Entries:
         if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
             raise ValueError("no bag of ROS 1")
         for header, data in _ros1_records(stream, allowance):
-            (number,) = struct.unpack("<I", header[b"conn"])
-            if header[b"op"] == CONNECTION:
-                about = _ros1_header(data)
-                topic = b"/" + b"/".join(part for part in header[b"topic"].split(b"/") if part)
-                text = about.get(b"message_definition", b"")
-                known[number] = _channel(topic, about.get(b"type", b""), ROS1, "ros1msg", text)
-                yield known[number], 0, None
-            elif number in known:
-                seconds, nanoseconds = struct.unpack("<II", header[b"time"])
-                yield known[number], seconds * 10**9 + nanoseconds, data
+            with suppress(KeyError, struct.error):  # a record that makes no sense costs no other one anything
+                (number,) = struct.unpack("<I", header[b"conn"])
+                if header[b"op"] == CONNECTION:
+                    about = _ros1_header(data)
+                    topic = b"/" + b"/".join(part for part in header[b"topic"].split(b"/") if part)
+                    text = about.get(b"message_definition", b"")
+                    known[number] = _channel(topic, about.get(b"type", b""), ROS1, "ros1msg", text)
+                    yield known[number], 0, None
+                elif number in known:
+                    seconds, nanoseconds = struct.unpack("<II", header[b"time"])
+                    yield known[number], seconds * 10**9 + nanoseconds, data
 
 
 MESSAGE, CHUNK, CHUNK_INFO, CONNECTION = b"\x02", b"\x05", b"\x06", b"\x07"
@@ -200,7 +206,7 @@ def _ros1_records(stream: BinaryIO, allowance: Allowance) -> Iterator[tuple[dict
     chunks = 0  # that are not in that table
     while size := stream.read(4):
         header = _ros1_header(stream.read(*struct.unpack("<I", size)))
-        op, (size,) = header[b"op"], struct.unpack("<I", stream.read(4))
+        op, (size,) = header.get(b"op"), struct.unpack("<I", stream.read(4))
         data = stream.read(size)
         chunks += (op == CHUNK) - (op == CHUNK_INFO)
         if op == CHUNK:

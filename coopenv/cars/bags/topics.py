@@ -177,7 +177,7 @@ def unread_truth(files: Sequence[BagFile], given: TopicMap, chosen: Sequence[Cho
     for file in files if bodies else ():
         trees = [name for name, kind in file.topics.items() if kind in TRANSFORMS]
         for topic, _, decode in islice(file.messages(trees), FIRST) if trees else ():
-            with suppress(CoopenvError):
+            with suppress(CoopenvError, AttributeError, TypeError, ValueError):  # fields other than ours
                 for part in decode().transforms:
                     if any(body in part.child_frame_id.split("/") for body in bodies):
                         found.setdefault(

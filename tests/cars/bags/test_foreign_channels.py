@@ -111,6 +111,59 @@ def test_a_foreign_channel_of_an_mcap_bag_has_no_effect(name: str, plain: Path, 
         assert f"/foreign0 ({LEFT_OUT[name]})" in line
 
 
+def record(opcode: int, body: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(body)) + body
+
+
+def text(value: bytes) -> bytes:
+    return struct.pack("<I", len(value)) + value
+
+
+ODD = {
+    "an attachment with a name in Latin-1": record(9, bytes(16) + text(b"\xb0.txt") + text(b"x") + bytes(12)),
+    "a damaged attachment": record(9, b"\xff" * 7),
+    "metadata in Latin-1": record(12, text(b"\xb0") + struct.pack("<I", 0)),
+    "a topic in Latin-1": record(4, struct.pack("<HH", 900, 0) + text(b"/\xb0") + text(b"cdr") + struct.pack("<I", 0)),
+    "a schema in Latin-1": record(3, struct.pack("<H", 900) + text(b"x/\xb0") + text(b"ros2msg") + text(b"")),
+    "a channel that breaks off": record(4, b"\x01"),
+    "a message that breaks off": record(5, b"\x01\x00"),
+    "a message of no channel": record(5, struct.pack("<HIQQ", 999, 0, 1, 1)),
+    "a private record": record(0x90, b"\xff" * 9),
+}
+"""Records that concern no topic of the map."""
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_an_odd_record_of_an_mcap_bag_has_no_effect(name: str, plain: Path, tmp_path: Path) -> None:
+    source, topics = plain / "mcap" / "mcap.mcap", plain / "topics.toml"
+    data, path = source.read_bytes(), tmp_path / "odd.mcap"
+    header = 8 + 9 + struct.unpack_from("<Q", data, 9)[0]  # behind the magic and the first record
+    path.write_bytes(data[:header] + ODD[name] + data[header:])
+    assert read(path, topics) == read(source, topics)
+
+
+def test_records_of_ros_1_that_make_no_sense_have_no_effect(plain: Path, tmp_path: Path) -> None:
+    whole, path = bags.write(tmp_path / "drive", sent(), "ros1"), tmp_path / "odd.bag"
+    data = whole.read_bytes()
+
+    def field(name: bytes, value: bytes) -> bytes:
+        return struct.pack("<I", len(name) + 1 + len(value)) + name + b"=" + value
+
+    odd = b""
+    for fields in (
+        field(b"op", b"\x07"),  # a connection without a number and a topic
+        field(b"op", b"\x07") + field(b"conn", b"\x09\x00\x00\x00"),  # without a topic
+        field(b"op", b"\x02") + field(b"conn", b"\x00\x00\x00\x00"),  # a message without a time
+        field(b"x", b"y"),
+    ):
+        odd += struct.pack("<I", len(fields)) + fields + struct.pack("<I", 0)
+    begin = data.index(b"\n") + 1
+    size = struct.unpack_from("<I", data, begin)[0]
+    first = begin + 8 + size + struct.unpack_from("<I", data, begin + 4 + size)[0]
+    path.write_bytes(data[:first] + odd + data[first:])
+    assert read(path, plain / "topics.toml") == read(whole, plain / "topics.toml")
+
+
 def test_foreign_topics_of_an_sqlite_bag_have_no_effect(plain: Path, tmp_path: Path) -> None:
     source, topics = plain / "sqlite3" / "sqlite3.db3", plain / "topics.toml"
     path = tmp_path / "more.db3"
@@ -127,7 +180,12 @@ def test_foreign_topics_of_an_sqlite_bag_have_no_effect(plain: Path, tmp_path: P
                 (name, language, text),
             )
             database.execute("insert into messages (topic_id, timestamp, data) values (?, ?, ?)", (number, 1, data))
+        row = {"id": 900, "name": "/o", "type": "std_msgs/msg/String"}
+        values = [row.get(column, "") for column in columns]
+        database.execute(f"insert into topics values ({','.join('?' * len(values))})", values)
+        database.execute("update topics set serialization_format = cast(x'b0' as text) where id = 900")
         database.execute("insert into messages (topic_id, timestamp, data) values (9999, 1, x'00')")
+        database.execute("insert into messages (topic_id, timestamp, data) values (900, 1, zeroblob(40000000))")
     database.close()
     samples, quiet = read(source, topics)
     found, warned = read(path, topics)
@@ -229,9 +287,10 @@ def test_poses_in_transforms_are_named_where_there_is_no_motion_capture(plain: P
     transforms = [{"header": codec.header(5, parent), "child_frame_id": child} for parent, child in parts]
     text, _ = codec.ros2().generate_msgdef(kind, ros_version=2)
     tree = ("cdr", kind, "ros2msg", text.encode(), codec.encode(codec.make(kind, transforms=transforms)))
+    other = ("cdr", kind, "ros2msg", b"uint8 x\n", b"\0\1\0\0\5")  # a type of that name with other fields
     captured = copied(plain / "mcap" / "mcap.mcap", tmp_path / "captured.mcap", [tree])
     assert not [line for line in read(captured, plain / "topics.toml")[1] if "transforms" in line]
     alone = bags.write(tmp_path / "alone", [m for m in sent() if "qualisys" not in m.topic], "mcap")
-    path = copied(next(alone.glob("*.mcap")), tmp_path / "tree.mcap", [tree])
+    path = copied(next(alone.glob("*.mcap")), tmp_path / "tree.mcap", [tree, other])
     [line] = [line for line in read(path, plain / "topics.toml")[1] if "transforms" in line]
     assert "/foreign0: mocap -> svea3;" in line and "table" not in line and "camera" not in line
