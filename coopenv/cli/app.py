@@ -61,18 +61,6 @@ def list_command(
         options.console().print(summary.list_table(rows, summary.COLUMNS[kind]))
 
 
-@app.command(rich_help_panel=LOOK)
-def examples(
-    folder: Annotated[Path, typer.Argument(help="Folder to write, beside other files if it exists.")] = Path(
-        "examples"
-    ),
-) -> None:
-    """Copy the examples: programs, scenarios, fleets of cars and ROS bags."""
-    from coopenv.base.installation import copy_examples
-
-    options.console().print(f"{copy_examples(folder)}: own_observer.py, bags, fleet and more", soft_wrap=True)
-
-
 @dataclass(frozen=True, kw_only=True)
 class DescribeOptions(options.SourceOptions):
     """Options of `coopenv describe`."""
@@ -108,6 +96,18 @@ def describe(given: DescribeOptions) -> None:
         out.print(part)
     if not given.everything:
         out.print("More: --all (every vehicle, setting and field), --json (all of it as data).")
+
+
+@app.command(rich_help_panel=LOOK)
+def examples(
+    folder: Annotated[Path, typer.Argument(help="Folder to write, beside other files if it exists.")] = Path(
+        "examples"
+    ),
+) -> None:
+    """Copy the examples: programs, scenarios, fleets of cars and ROS bags."""
+    from coopenv.base.installation import copy_examples
+
+    options.console().print(f"{copy_examples(folder)}: own_observer.py, bags, fleet and more", soft_wrap=True)
 
 
 @app.command(rich_help_panel=LOOK)
