@@ -227,7 +227,8 @@ def test_the_commands_of_the_readme_need_no_clone(wheel: Path, tmp_path: Path) -
     (bag,) = re.findall(r"^coopenv (run examples/bags[^#\n]*)", text, re.MULTILINE)
     assert "vehicle_1" in coopenv(*bag.split(), "--until", "4")
     (own,) = re.findall(r"^coopenv (bench observers .*own_observer[^#\n]*)", text, re.MULTILINE)
-    coopenv(*own.split(), "--seeds", "1", "--seconds", "3", "--observers", "examples/own_observer.py:Ekf")
+    short = ("--seeds", "1", "--override", "horizon=4", "--steady-from", "2")
+    coopenv(*own.split(), *short, "--observers", "examples/own_observer.py:Ekf")
     assert (empty / "out" / "mine").is_dir()
 
 
