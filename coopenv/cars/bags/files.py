@@ -72,11 +72,8 @@ class BagFile:
         self.channels = frozenset(channel for channel in counts if channel.readable)
         self.topics: dict[str, str] = {}
         """Type of every topic that can be read; empty where messages of several types came on it."""
-        self.counts, definitions = Counter[str](), Counter[str]()
+        self.counts = Counter[str]()
         for channel in sorted(self.channels):
-            definitions[channel.topic] += 1
-            if definitions[channel.topic] > MOST_DEFINITIONS:
-                raise DataError(f"{path}: {printable(channel.topic)} has over {MOST_DEFINITIONS} types and definitions")
             same = self.topics.get(channel.topic, channel.kind) == channel.kind
             self.topics[channel.topic] = channel.kind if same else ""
             self.counts[channel.topic] += counts[channel]
@@ -132,6 +129,9 @@ class BagFile:
         """
         from coopenv.cars.bags.definitions import decode
 
+        for topic, count in Counter(c.topic for c in self.channels if c.topic in topics).items():
+            if count > MOST_DEFINITIONS:
+                raise DataError(f"{self.path}: {printable(topic)} has over {MOST_DEFINITIONS} types and definitions")
         for channel, received, data in self._raw(topics):
             yield channel.topic, received, partial(decode, channel, data)
 

@@ -294,3 +294,21 @@ def test_poses_in_transforms_are_named_where_there_is_no_motion_capture(plain: P
     path = copied(next(alone.glob("*.mcap")), tmp_path / "tree.mcap", [tree, other])
     [line] = [line for line in read(path, plain / "topics.toml")[1] if "transforms" in line]
     assert "/foreign0: mocap -> svea3;" in line and "table" not in line and "camera" not in line
+
+
+def test_many_definitions_of_a_topic_matter_where_it_is_read(tmp_path: Path, plain: Path) -> None:
+    from mcap.writer import Writer
+
+    path = tmp_path / "many.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="test")
+        for k in range(40):
+            schema = writer.register_schema("x/msg/T", "ros2msg", f"uint8 a{k}\n".encode())
+            channel = writer.register_channel("/t", "cdr", schema)
+            writer.add_message(channel, 1, b"\0\1\0\0\1", 1)
+        writer.finish()
+    with BagFile(path) as bag:
+        assert bag.counts["/t"] == 40 and len(bag.times()["/t"][0]) == 40
+        with pytest.raises(DataError, match=r"/t has over 32 types and definitions"):
+            next(bag.messages(["/t"]))
