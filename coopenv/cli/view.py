@@ -122,8 +122,8 @@ class FilmOptions(SceneOptions):
     camera: Annotated[
         str,
         typer.Option(
-            help="With --3d: overview, follow or driver; several with commas between: one below another.",
-            autocompletion=options.completion(lambda: ("overview", "follow", "driver"), several=True),
+            help="With --3d: overview, follow, pair or driver; several with commas between: one below another.",
+            autocompletion=options.completion(lambda: ("overview", "follow", "pair", "driver"), several=True),
         ),
     ] = "overview"
     vehicle: Annotated[

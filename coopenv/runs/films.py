@@ -16,9 +16,9 @@ from coopenv.base.installation import install_command
 from coopenv.viz.scene import Frame, SceneRecord
 
 if TYPE_CHECKING:  # imports Matplotlib, which is only needed where there is a film
-    from coopenv.viz.perspective import View3d
     from coopenv.viz.stage import Stage
     from coopenv.viz.topview import TopView
+    from coopenv.viz.view3d import View3d
 
 SUFFIXES = (".mp4", ".gif", ".webp")
 """Formats of films: MP4 through ffmpeg where the extra `video` is installed, animated GIF and WebP through Pillow."""
@@ -52,7 +52,7 @@ class Shot(NamedTuple):
     record: SceneRecord
     view: "TopView | View3d"
     name: str = ""
-    """Stands above the picture, with whether the vehicles are lost; empty: nothing does."""
+    """Stands above the picture, with driver, observer and the number of lost vehicles; empty: no heading."""
 
 
 def write_film(
@@ -110,15 +110,15 @@ def space_film(
     """Return the 3-D film of scenes.
 
     Args:
-        takes: a column of the picture each, with its name (empty: that of the observer).
+        takes: a column of the picture each, with its name (empty: the name of the environment).
         width: of the whole picture, pixels.
-        cameras: a row of the picture each, of `film3d.CAMERAS`.
+        cameras: a row of the picture each, of `view3d.CAMERAS`.
         vehicle: index of the one that is followed, or whose camera it is.
 
     Raises:
         CoopenvError: no such camera, or the extra is missing.
     """
-    from coopenv.viz.perspective import View3d
+    from coopenv.viz.view3d import View3d
 
     each = width // len(takes)
     size = each, each * 9 // 16 if len(takes) == 1 else each * 3 // 4
@@ -127,7 +127,7 @@ def space_film(
         return Shot(record, View3d(record.scenario, size, camera, vehicle), name)
 
     heading, *rows = cameras
-    first = [shot(name or record.source.observer, record, heading) for name, record in takes]
+    first = [shot(name or record.source.name, record, heading) for name, record in takes]
     return [first, *([shot("", record, camera) for _, record in takes] for camera in rows)]
 
 
@@ -138,28 +138,50 @@ def _picture(shot: Shot, k: int) -> np.ndarray:
     return np.vstack([_heading(shot, frame, picture.shape[:2]), picture]) if shot.name else picture
 
 
-_BAND = (2 / 15, 0.1)  # of the height and of the width of a picture, height of its heading at most
+_BAND = (1 / 6, 0.13)  # of the height and of the width of a picture, height of its heading at most
+_START = 1.0  # s in which an estimate may still be the one that was drawn
 
 
 def _heading(shot: Shot, frame: Frame, size: tuple[int, int]) -> np.ndarray:
-    """Return a band with the name of a shot and how many vehicles are lost, in the colour of success or failure."""
+    """Return a band with a shot's name, driver and observer, the number of lost vehicles, and the cause of the loss."""
     from coopenv.viz.stage import Stage
     from coopenv.viz.style import GREEN, VERMILION
 
-    count, total = int(lost(Stage(shot.record.scenario), frame).sum()), len(frame.nees)
+    stage, source = Stage(shot.record.scenario), shot.record.source
+    count, total = int(lost(stage, frame).sum()), len(frame.nees)
     found = f"{count} of {total} lost" if count and total > 1 else "lost" if count else "found"
+    makers = {
+        f"{kind} {name}": name for kind, name in (("driver", source.policy), ("observer", source.observer)) if name
+    }
+    title = next((words for words, name in makers.items() if name == shot.name), shot.name)
+    left = title, ", ".join(words for words in makers if words != title)
+    right = found, cause_of_loss(shot.record, stage, frame) if count else ""
     width, height = size[1], round(min(share * edge for share, edge in zip(_BAND, size, strict=True)))
     band = Image.new("RGB", (width, height), VERMILION if count else GREEN)
-    draw, middle = ImageDraw.Draw(band), height / 2
-    draw.text((middle / 2, middle), shot.name, "white", ImageFont.load_default(0.5 * height), anchor="lm")
-    place = (width - middle / 2, middle)
-    draw.text(place, found, "white", ImageFont.load_default(0.62 * height), anchor="rm", stroke_width=1)
+    draw, margin = ImageDraw.Draw(band), height / 4
+    for words, place, anchor in ((left, margin, "lm"), (right, width - margin, "rm")):
+        draw.text((place, 0.33 * height), words[0], "white", ImageFont.load_default(0.42 * height), anchor=anchor)
+        draw.text((place, 0.75 * height), words[1], "white", ImageFont.load_default(0.23 * height), anchor=anchor)
     return np.asarray(band)
 
 
 def lost(stage: "Stage", frame: Frame) -> np.ndarray:
     """Return (N,) which vehicles are farther from their estimates than they are long."""
     return np.asarray(frame.position_error > stage.bodies()[0][:, 0])
+
+
+def cause_of_loss(record: SceneRecord, stage: "Stage", frame: Frame) -> str:
+    """Return why vehicles are lost: the observer is wrong, or the vehicle sees too little.
+
+    An error within three stated standard deviations is no mistake of the observer: the drivers kept too few targets in
+    view.
+    """
+    if frame.tick < _START * record.scenario.rates.camera:
+        return "initial estimates"
+    stated = record.source.honest & (frame.position_error <= frame.three_sigma)
+    if (lost(stage, frame) & ~stated).any():
+        return "the observer is wrong"
+    return "the drivers see too little" if record.source.policy else "stated as uncertain"
 
 
 def frames_at(time: np.ndarray, fps: float, speed: float) -> np.ndarray:

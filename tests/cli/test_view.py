@@ -65,7 +65,7 @@ def test_several_films_stand_side_by_side(capsys: pytest.CaptureFixture[str]) ->
     space = ["--3d", "--camera", "overview,driver", "--width", "320", "--vehicle", "f2"]
     assert main([*command, *space, "--out", "space.webp"]) == 0
     with Image.open("space.webp") as film:
-        assert film.n_frames == 3 and film.size == (320, 16 + 120 + 120)
+        assert film.n_frames == 3 and film.size == (320, 20 + 120 + 120)
     assert "unknown camera of a film 'above'" in refused(*command, "--3d", "--camera", "above", "--out", "x.gif")
 
 

@@ -14,13 +14,15 @@ from scipy.spatial.transform import Rotation
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
+from coopenv.estimation import Sight
+from coopenv.runs.films import cause_of_loss
 from coopenv.viz.perspective import Lens
-from coopenv.viz.scene import Frame
+from coopenv.viz.scene import Frame, Origin, SceneRecord
 from coopenv.viz.stage import Stage, entries
 from coopenv.viz.style import vehicle_colour
 
 pytest.importorskip("pyvista", reason="needs the extra film3d")
-from coopenv.viz.perspective import View3d
+from coopenv.viz.view3d import View3d
 
 SIZE = (480, 360)
 
@@ -33,10 +35,10 @@ def frame() -> Iterator[Frame]:
 
 
 def seen_from_above(point: np.ndarray, stage: Stage) -> tuple[int, int]:
-    """Column and row of a point in the overview: a pinhole camera of 40 deg, 1.35 sides to the south and above."""
+    """Column and row of a point in the overview: a pinhole camera of 40 deg, 1.15 sides to the south and above."""
     middle = stage.middle - np.array([0.0, 0.03 * stage.side, 0.0])
     forward, right = np.array([0.0, 0.6, -0.8]), np.array([1.0, 0.0, 0.0])
-    ray = point - (middle - 1.35 * stage.side * forward)
+    ray = point - (middle - 1.15 * stage.side * forward)
     focal = SIZE[1] / 2 / np.tan(np.radians(20.0))
     depth = ray @ forward
     return (
@@ -102,6 +104,54 @@ def test_a_driver_sees_targets_where_its_camera_images_them(frame: Frame) -> Non
     assert picture[round(v), round(u)].mean() < 70.0 < picture[round(v), round(u) - 40].mean()  # a landmark is dark
 
 
+def test_the_pair_camera_shows_both_cars_with_the_line_of_sight_between_them() -> None:
+    scenario = coopenv.load_scenario("lighthouse")
+    with closing(Engine(scenario)) as engine:
+        engine.reset([0])
+        start = Frame.of(engine)
+    leader, follower = start.landmarks, start.landmarks + 1
+    sight = np.full_like(start.sight, Sight.OUT_OF_VIEW)
+    seen = sight.copy()
+    seen[1, leader] = Sight.VISIBLE
+    blind, seeing = replace(start, sight=sight), replace(start, sight=seen)
+    place = start.position.copy()
+    place[leader] += 0.5 * start.rotation[leader, :, 0]
+    second = start.tick + round(scenario.rates.camera)
+    with closing(View3d(scenario, SIZE, "pair", 1)) as view:
+        pictures = [view.paint(frame).astype(float) for frame in (blind, seeing)]
+        pixels = [np.array(view.pixel(start.position[i])) for i in (leader, follower)]
+        view.paint(replace(blind, position=place, tick=second))
+        slow = view.waits
+        place = place.copy()
+        place[leader] += start.rotation[leader, :, 0]
+        view.paint(replace(blind, position=place, tick=second + round(scenario.rates.camera)))
+        assert slow and not view.waits  # 0.5 m/s and 1 m/s, of 1 m/s
+    for (u, v), i in zip(pixels, (0, 1), strict=True):
+        assert 0 < u < SIZE[0] and 0 < v < SIZE[1]
+        assert hue_around(pictures[0], (round(u), round(v)), vehicle_colour(i)) > 0.9
+    assert np.linalg.norm(pixels[1] - pixels[0]) > 0.4 * SIZE[1]
+    column, row = np.round((pixels[0] + pixels[1]) / 2).astype(int)
+    changed = np.abs(pictures[1] - pictures[0]).sum(axis=-1)
+    assert changed[row - 9 : row + 10, column - 9 : column + 10].max() > 60.0
+
+
+def test_a_heading_names_the_cause_of_a_loss(frame: Frame) -> None:
+    """Metres of error are the drivers' fault where the covariance states them, and else the observer's."""
+    scenario, stage = coopenv.load_scenario("urban_crossing"), Stage(coopenv.load_scenario("urban_crossing"))
+    far = replace(frame, tick=frame.tick + 100, position_error=np.full(4, 5.0))
+
+    def cause(covariance: float, **source: object) -> str:
+        stated = replace(far, position_covariance=covariance * np.tile(np.eye(3), (4, 1, 1)))
+        record = SceneRecord.of_frames(scenario, Origin.of("urban_crossing", scenario, **source), [stated])
+        return cause_of_loss(record, stage, stated)
+
+    assert cause(4.0, policy="peek") == "the drivers see too little"
+    assert cause(4.0) == "stated as uncertain"
+    assert cause(1.0, policy="peek") == "the observer is wrong"
+    record = SceneRecord.of_frames(scenario, Origin.of("urban_crossing", scenario), [frame])
+    assert cause_of_loss(record, stage, frame) == "initial estimates"
+
+
 def test_an_unknown_camera_is_reported() -> None:
-    with pytest.raises(CoopenvError, match="unknown camera of a film 'above'; known: overview, follow, driver"):
+    with pytest.raises(CoopenvError, match="unknown camera of a film 'above'; known: overview, follow, pair, driver"):
         View3d(coopenv.load_scenario("facade"), SIZE, "above")
