@@ -34,6 +34,8 @@ _LANES = 14  # dashes of a road's marks over a side of the scene
 _BEHIND, _ABOVE = 5.5, 2.6  # lengths of the vehicle, of the camera that follows it
 _STEEP, _SHARE = 50.0, 0.62  # of the camera above a pair: elevation, deg, and share of the height between the two
 _SLOW = 0.75  # of the top speed, below which a vehicle of a pair waits
+LEGEND = "solid: true pose, faded: estimate, thin line: measured by a camera, ball: landmark"
+"""Stands in pictures, but for those through a vehicle's camera."""
 _LEFTMOST = 60.0  # deg, vertical field of view of a driver's camera that sees in every direction
 
 
@@ -105,7 +107,7 @@ class View3d:
             self._move_camera(frame, R)
         self._plot.render()
         picture = np.asarray(self._plot.screenshot(return_img=True))[..., :3].copy()
-        return picture if pair is None else self._captioned(picture, frame, pair)
+        return self._lettered(picture, frame, {} if pair is None else self._captions(frame, pair))
 
     def close(self) -> None:
         """Let go of the renderer."""
@@ -228,8 +230,8 @@ class View3d:
         camera.focal_point, camera.up, camera.view_angle = tuple(middle), (0.0, 0.0, 1.0), _ANGLE
         camera.clipping_range = (0.05 * distance, 60.0 * self._stage.side)
 
-    def _captioned(self, picture: np.ndarray, frame: Frame, pair: list[int]) -> np.ndarray:
-        """Return a picture with captions: what the picked vehicle sees, and whether the other vehicle waits."""
+    def _captions(self, frame: Frame, pair: list[int]) -> dict[int, str]:
+        """Return, by vehicle of a pair, what the picked one sees, and whether the other one waits."""
         before, (picked, other) = self._before, pair
         if before is None or frame.tick > before.tick:
             self._before = frame
@@ -239,17 +241,25 @@ class View3d:
             self.waits = speed < _SLOW * self._stage.scenario.limits[other].max_speed
         seen = np.flatnonzero(frame.sight[picked] == Sight.VISIBLE)
         names = ", ".join(self._stage.short_name(int(target)) for target in seen[:2]) + ", ..." * (len(seen) > 2)
-        captions = {picked: f"sees {names or 'nothing'}"}
-        if other != picked:
-            captions[other] = "waits" if self.waits else "drives on"
+        driving = {other: "waits" if self.waits else "drives on"} if other != picked else {}
+        return {**driving, picked: f"sees {names or 'nothing'}"}
+
+    def _lettered(self, picture: np.ndarray, frame: Frame, captions: dict[int, str]) -> np.ndarray:
+        """Return a picture with the legend, and captions beside vehicles."""
         image = Image.fromarray(picture)
         height, width = picture.shape[:2]
-        look: dict[str, Any] = {"font": ImageFont.load_default(0.06 * height), "fill": INK, "stroke_width": 2}
+        draw = ImageDraw.Draw(image)
+        look: dict[str, Any] = {"fill": INK, "stroke_width": 2, "stroke_fill": "white"}
+        if self._camera != "driver":
+            small = ImageFont.load_default(0.034 * height)
+            draw.text((0.02 * width, 0.97 * height), LEGEND, font=small, anchor="ls", **look)
+        font = ImageFont.load_default(0.06 * height)
         for i, words in captions.items():
             u, v = self.pixel(frame.vehicle_position[i])
+            text = f"{stage.vehicle_mark(i)} {words}"
             if np.isfinite([u, v]).all():
-                text = f"{stage.vehicle_mark(i)} {words}"
-                ImageDraw.Draw(image).text((u + 0.08 * width, v), text, stroke_fill="white", anchor="lm", **look)
+                left = min(u + 0.08 * width, width - draw.textlength(text, font) - 3)
+                draw.text((left, v), text, font=font, anchor="lm", **look)
         return np.asarray(image)
 
     def pixel(self, point: np.ndarray) -> tuple[float, float]:
