@@ -140,14 +140,14 @@ class Engine:
         self.begun = True
         return seeds
 
-    def check_begun(self) -> None:
-        """Make sure that there is something to step.
+    def check_begun(self, call: str) -> None:
+        """Make sure that there is an episode that a call of this name can act on.
 
         Raises:
             CoopenvError: nothing has been reset.
         """
         if not self.begun:
-            raise CoopenvError("step() called before reset()")
+            raise CoopenvError(f"{call}() called before reset()")
 
     def load(self) -> None:
         """Load all kernels, compiling the missing ones; nothing moves."""

@@ -112,7 +112,9 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         space = observation_space(self.engine.layout, observation)
         self.observation_spaces = {agent: space for agent in self.possible_agents}
         self.action_spaces = {agent: action_space(scenario) for agent in self.possible_agents}
-        self.state_space = spaces.Box(-STATE_LIMIT, STATE_LIMIT, shape=self.state().shape, dtype=np.float32)
+        self.state_space = spaces.Box(
+            -STATE_LIMIT, STATE_LIMIT, shape=world_states(self.engine.view, self.scenario).shape[1:], dtype=np.float32
+        )
         self._step, self._outcomes = Step(self.engine.view, scenario), outcome_words(scenario)
         self._targets = scenario.target_names  # made once, as every step needs both
         self._notes = backend.notes if isinstance(backend, Broadcasting) else None
@@ -182,7 +184,7 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
             ActionError: an action is missing, unknown, of the wrong shape, or not finite.
             CoopenvError: `reset` has not been called.
         """
-        self.engine.check_begun()
+        self.engine.check_begun("step")
         alive = self._agents
         if not alive:
             return {}, {}, {}, {}, {}
@@ -284,6 +286,7 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
 
     def state(self) -> np.ndarray:
         """Return the state for a central critic, (S,), with the truth; see `coopenv.api.arguments.world_states`."""
+        self.engine.check_begun("state")
         return np.asarray(world_states(self.engine.view, self.scenario)[0])
 
     @partial(explained, hint=RENDER_HINT)
@@ -292,8 +295,7 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         if self.render_mode is None:
             warnings.warn(NO_PICTURE, stacklevel=2)
             return None
-        if not self.engine.begun:
-            raise CoopenvError("render() called before reset()")
+        self.engine.check_begun("render")
         picture = self.engine.picture()
         if self.render_mode == "human":
             self.engine.top_view.show(picture)

@@ -159,7 +159,7 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
             ActionError: wrong shape or dtype, or (host arrays) not finite.
             CoopenvError: `reset` has not been called.
         """
-        self.engine.check_begun()
+        self.engine.check_begun("step")
         self._follow_torch()
         self._set_actions(actions)
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
@@ -174,6 +174,7 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def state(self) -> np.ndarray:
         """Return the states of the worlds for a central critic, (num_worlds, S); see `world_states`."""
+        self.engine.check_begun("state")
         return world_states(self.engine.view, self.scenario)
 
     def _observations(self) -> Any:

@@ -8,6 +8,21 @@ from pydantic import AfterValidator, ConfigDict, Field, create_model, model_vali
 
 from coopenv.base.errors import listed, suggest
 from coopenv.base.sections import NonNegative, Number, Positive, Probability, Section
+from coopenv.base.units import (
+    ACCELERATION,
+    DISTANCE,
+    DRIVEN_SPEED,
+    EXTENT,
+    LAG,
+    LENGTH,
+    PLACE,
+    SPEED,
+    SPEED_ERROR,
+    STEERING,
+    TIME,
+    TURN,
+    TURN_RATE,
+)
 from coopenv.scenario.terms import (
     GROUPS,
     OBSERVATION_FIELDS,
@@ -35,19 +50,19 @@ class Observation(Section):
     """Groups and fields that are removed again, for an ablation."""
     planar: bool = False
     """Omit heights, roll and pitch, which a vehicle on a plane cannot change."""
-    position_scale: Positive = 50.0
+    position_scale: Annotated[Positive, PLACE] = 50.0
     """m, of positions and distances"""
-    velocity_scale: Positive = 5.0
+    velocity_scale: Annotated[Positive, SPEED] = 5.0
     """m/s, of measured velocities"""
-    angular_velocity_scale: Positive = 3.0
+    angular_velocity_scale: Annotated[Positive, TURN_RATE] = 3.0
     """rad/s, of measured angular velocities"""
-    age_scale: Positive = 1.0
+    age_scale: Annotated[Positive, TIME] = 1.0
     """s; older measurements read 1"""
-    map_scale: Positive = 10.0
+    map_scale: Annotated[Positive, DISTANCE] = 10.0
     """m, of landmarks of the map"""
     map_size: int = Field(default=8, ge=1, le=256)
     """Number of map landmarks in the fields per landmark: the nearest to the vehicle's own estimate."""
-    route_step: Positive = 0.5
+    route_step: Annotated[Positive, EXTENT] = 0.5
     """m; `route_ahead` shows the way so far ahead, and twice, four and eight times as far"""
     scales: dict[str, Positive] = Field(default={})
     """Scales of single fields by name, in place of their own."""
@@ -76,25 +91,25 @@ class Observation(Section):
 class Dynamics(Section):
     """Kinematic bicycle with its actuators; the defaults are a SVEA car's."""
 
-    wheelbase: Positive = 0.324
+    wheelbase: Annotated[Positive, LENGTH] = 0.324
     """m, from the rear to the front axle"""
-    max_speed: Positive = 1.53
+    max_speed: Annotated[Positive, DRIVEN_SPEED] = 1.53
     """m/s, forwards"""
     reverse: bool = False
     """Allow negative speeds."""
-    max_acceleration: Positive = 2.0
+    max_acceleration: Annotated[Positive, ACCELERATION] = 2.0
     """m/s^2"""
-    max_steering: float = Field(default=0.6981317007977318, gt=0.0, lt=1.5)
+    max_steering: Annotated[float, Field(gt=0.0, lt=1.5), STEERING] = 0.6981317007977318
     """rad, to either side"""
-    max_steering_rate: Positive = 2.0
+    max_steering_rate: Annotated[Positive, TURN_RATE] = 2.0
     """rad/s"""
-    speed_time_constant: NonNegative = 0.1
+    speed_time_constant: Annotated[NonNegative, LAG] = 0.1
     """First-order lag of the drive, s."""
-    steering_time_constant: NonNegative = 0.05
+    steering_time_constant: Annotated[NonNegative, LAG] = 0.05
     """First-order lag of the steering, s."""
-    latency: NonNegative = 0.0
+    latency: Annotated[NonNegative, LAG] = 0.0
     """Dead time between a decision and its effect, s; at most one decision period."""
-    dead_band: NonNegative = 0.0
+    dead_band: Annotated[NonNegative, SPEED_ERROR] = 0.0
     """Speed commands of a smaller magnitude do not move the car, as its speed controller has them, m/s."""
     gated: bool = False
     """Limit the change of commands between decisions by the acceleration and `max_steering_rate`, as the gate of a SVEA
@@ -110,9 +125,9 @@ class Dynamics(Section):
 class Pan(Section):
     """A camera that turns about its own centre and the body's z axis; the vehicle knows the angle."""
 
-    limit: float = Field(gt=0.0, le=math.pi)
+    limit: Annotated[float, Field(gt=0.0, le=math.pi), TURN]
     """Largest angle to either side, rad; an entry of 1 asks for it (positive turns left)."""
-    rate: Positive
+    rate: Annotated[Positive, TURN_RATE]
     """Largest angular rate, rad/s."""
 
 
@@ -121,7 +136,7 @@ class Action(Section):
 
     longitudinal: Literal["speed", "acceleration"] = "speed"
     """`speed`: -1..1 spans the permitted speeds (0 or -max .. max); `acceleration`: times max_acceleration."""
-    steering: Positive | None = None
+    steering: Annotated[Positive | None, STEERING] = None
     """Steering angle at action 1, rad (none: max_steering)."""
     pan: Pan | None = None
     """None: cameras do not turn."""
@@ -164,9 +179,9 @@ class Reward(Section):
     vehicles, the least over the vehicles under way."""
     own_share: Probability = 0.0
     """Share of a vehicle's own weighted sum in its reward with a team; the rest is the team's."""
-    uncertainty_threshold: NonNegative = 0.02
+    uncertainty_threshold: Annotated[NonNegative, LENGTH] = 0.02
     """Threshold, m; terms per metre count the excess"""
-    uncertainty_cap: Positive = 1.0
+    uncertainty_cap: Annotated[Positive, EXTENT] = 1.0
     """Largest counted excess, m; also the price of a metre that is never driven"""
     observability_floor: Positive = 1e-5
     """Addition to the smallest eigenvalue of the sliding Gramian before the logarithm: above the rounding of 0"""
@@ -204,7 +219,7 @@ class Termination(Section):
     """Touching a building or another body ends the vehicle's episode."""
     arrival: bool = True
     """Reaching its goal ends the vehicle's episode."""
-    off_route: Positive | None = None
+    off_route: Annotated[Positive | None, EXTENT] = None
     """A vehicle that is so far beside its route, or beyond an end of it, has left the road, and its episode ends, m."""
     after_arrival: Literal["park", "leave", "continue", "transit"] = "park"
     """`park`: a vehicle that has arrived stands where it is; `leave`: it is gone from the next camera tick on;

@@ -6,7 +6,7 @@ import warnings
 from collections import Counter
 from collections.abc import Collection, Iterator, KeysView, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -15,6 +15,7 @@ from coopenv.base.columns import facts_html, one_line, picture_html
 from coopenv.base.errors import ScenarioError, ScenarioWarning, check_one_of, listed, shown, suggest
 from coopenv.base.installation import load_reference
 from coopenv.base.sections import Positive, Section, Text, Vector3, overlaid, validated
+from coopenv.base.units import EPISODE, PLACE, TIME, warn_of_implausible
 from coopenv.scenario.bodies import MOST_LANDMARKS, Landmark, LandmarkGroup, Obstacle, Road, Vehicle
 from coopenv.scenario.cosimulators import COSIMULATORS, Cosimulator, Highway, Program, Sumo
 from coopenv.scenario.learning import Action, Difficulty, Dynamics, Observation, Randomisation, Reward, Termination
@@ -44,7 +45,7 @@ READ = "coopenv.load_scenario reads one by name, from a file or from a dict"
 class Map(Section):
     """The frame in which vehicles know the landmarks."""
 
-    origin: Vector3 = (0.0, 0.0, 0.0)
+    origin: Annotated[Vector3, PLACE] = (0.0, 0.0, 0.0)
     """Point of this file's coordinates at which the map frame has its origin; keep it inside the scene."""
 
 
@@ -67,7 +68,7 @@ class Scenario(Section, metaclass=_Loaded):
     description: Text = ""
     source: Text = ""
     """Source of the numbers."""
-    horizon: Positive
+    horizon: Annotated[Positive, EPISODE]
     """Length of an episode, s."""
     backend: Literal["simulated", "highway", "sumo", "program"] = "simulated"
     """Simulator that moves the vehicles: coopenv itself, or a co-simulator with the section of this name."""
@@ -256,8 +257,15 @@ class Scenario(Section, metaclass=_Loaded):
                 raise ValueError(f"landmark name '{landmark.name}' is reserved for vehicles")
         return landmarks
 
+    @property
+    def _extent(self) -> float:
+        """Largest plausible coordinate, m: farther with roads, and with many vehicles and routes."""
+        roads = (abs(x) for road in self.roads for x in (*road.start, *road.end))
+        return PLACE.most + max(roads, default=0.0) + 50.0 * (len(self.vehicles) + len(self.routes))
+
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
+        warn_of_implausible(self, {PLACE: self._extent / PLACE.most, TIME: max(1.0, self.horizon / TIME.most)})
         vehicles, targets = len(self.vehicles), len(self.target_names)
         if vehicles * targets > MOST_PAIRS and self.topology.most_nearby is None:
             pairs = f"{vehicles} times {targets} targets are over {MOST_PAIRS:.0e} pairs"

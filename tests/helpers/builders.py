@@ -44,7 +44,7 @@ def raw(vehicles: Sequence[dict[str, Any]] | None = None, **sections: Any) -> di
     """Return the data of a scenario: by default one standing vehicle among four landmarks."""
     return {
         "title": "test",
-        "horizon": 10000.0,
+        "horizon": 3600.0,
         "landmarks": [landmark(f"L{i + 1}", p) for i, p in enumerate(LANDMARKS)],
         "camera": {"orientation": "body"},
         "vehicles": list(vehicles) if vehicles is not None else [vehicle()],
