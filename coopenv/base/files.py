@@ -100,9 +100,14 @@ def exchange(part: Path, place: Path, old: Path) -> None:
         raise
 
 
+def _hidden(place: Path, suffix: str) -> str:
+    """Return the pattern of the hidden folders beside a place."""
+    return f".{escape(place.name)}.{'[0-9a-f]' * 8}{suffix}"
+
+
 def clean(place: Path, names: Collection[str]) -> None:
     """Remove what killed runs have left beside a place; finish a replacement that one had begun."""
-    for left in place.parent.glob(f".{escape(place.name)}.{'[0-9a-f]' * 8}.*"):
+    for left in place.parent.glob(_hidden(place, ".*")):
         if left.suffix == PART:
             shutil.rmtree(left, ignore_errors=True)
         elif left.suffix == OLD and not os.path.lexists(place):
@@ -203,10 +208,10 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
         names: of all files that such a result can have.
 
     Raises:
-        OutputError: it cannot be written or replaced, which is found before anything is yielded where it can be known;
-            the old folder is untouched.
+        OutputError: it cannot be written or replaced, or another run is writing there, which is found before anything
+            is yielded where it can be known; the old folder is untouched.
     """
-    with _staging(folder, partial(_check_folder, names), names) as (place, part):
+    with _staging(folder, partial(_check_folder, names), names) as (place, part), _alone(folder, place, part):
         try:
             yield part
         except OutputError as error:
@@ -226,6 +231,24 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
                 raise OutputError(f"cannot replace {folder}: {why}") from None
             _written(folder, place)
         sync(place.parent)
+
+
+@contextmanager
+def _alone(folder: str | Path, place: Path, part: Path) -> Iterator[None]:
+    """Hold the folder `part` of a run. Raises OutputError: another run holds one for the same place."""
+    own = lock(part)  # before looking for others: of two runs at once, at least one finds the other
+    try:
+        for other in place.parent.glob(_hidden(place, PART)) if own is not None else ():
+            if other == part:
+                continue
+            with suppress(FileNotFoundError):  # removed meanwhile
+                if (free := lock(other)) is None:
+                    raise OutputError(f"cannot write to {folder}: another run is writing its results there")
+                os.close(free)
+        yield
+    finally:
+        if own is not None:
+            os.close(own)
 
 
 @contextmanager

@@ -27,7 +27,17 @@ from coopenv.observers.contract import Factory
 from coopenv.observers.registry import states_covariance, with_observer
 from coopenv.policies import Policy
 from coopenv.runs.bundle import RECORD_FILE, RunRecord
-from coopenv.runs.console import Progress, compile_notice, estimates_table, gaps, legend, metrics_table, rates, remarks
+from coopenv.runs.console import (
+    Progress,
+    compile_notice,
+    estimates_tables,
+    gaps,
+    legend,
+    metrics_tables,
+    note_overwritten,
+    rates,
+    remarks,
+)
 from coopenv.runs.films import VIDEO_FILES, top_view_film, video_path, write_film
 from coopenv.runs.rollouts import Rollout, estimates, run_metrics, theory_rates, vehicle_metrics
 from coopenv.runs.scenes import Keeper, frame_stride, source_of, write_page
@@ -80,6 +90,7 @@ def execute(
     paced = scenario.rates.camera if able.real_time and not able.simulated_clock else None
     doing = "replaying" if able.recorded else "driving" if able.real_time else "simulating"
     with nullcontext() if out is None else replacing_folder(out, result_names()) as folder:
+        note_overwritten(out, METRICS_FILE, log)
         with compile_notice(log):
             run.engine.load()
         keeper = Keeper(run.engine, source_of(run.engine, name, run.seed, run.policy_name))
@@ -319,7 +330,7 @@ class Results(Tabular):
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         if others := self.metrics.get("without_truth"):
-            yield estimates_table(others)
+            yield from estimates_tables(others, options.max_width)
             yield f"No true poses, and so no errors. Standard deviations: mean after {self.steady_from:g} s."
         if not self.metrics["vehicles"]:
             return
@@ -327,11 +338,11 @@ class Results(Tabular):
             yield ""
         shown, end = shown_vehicles(self.trajectory, self.steady_from, self.ends), float(self.trajectory.t[-1])
         vehicles = [self.metrics["vehicles"][i] for i in shown]
-        yield metrics_table(vehicles)
+        yield from metrics_tables(vehicles, options.max_width)
         if note := shown_note(len(self.trajectory.vehicles)):
             yield f"{note}; all of them: {METRICS_FILE}"
         yield ""
-        yield from rates(vehicles)
+        yield from rates(vehicles, options.max_width)
         yield from gaps(self.metrics, len(self.trajectory.t), end)
         yield from legend(self.steady_from, end, self.trajectory.nees_dof)
         yield from remarks(vehicles)

@@ -1,11 +1,13 @@
 """Progress, notices and tables on the terminal."""
 
+import json
 import math
 import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from math import inf, isnan, nan
+from pathlib import Path
 from time import monotonic
 from typing import Any, Self
 
@@ -16,6 +18,7 @@ from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeRemainingCol
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from coopenv.base.errors import shortened
 from coopenv.base.format import column, number, seconds
 from coopenv.base.terminal import NumberTable
 from coopenv.estimation.metrics import CONVERGED, SETTLED
@@ -120,6 +123,17 @@ class Progress:
             self._log.print(self.line(), soft_wrap=True)
 
 
+def note_overwritten(folder: Path | None, name: str, log: Console) -> None:
+    """Print in one line the earlier result in a folder that a run will overwrite; `name` is that of its facts' file."""
+    if folder is not None and (path := folder / name).is_file():
+        facts: Any = {}
+        with suppress(OSError, ValueError):
+            facts = json.loads(path.read_text(encoding="utf-8"))
+        words = facts if isinstance(facts, dict) else {}
+        seed = f"seed {words['seed']} of {words.get('environment')}" if "seed" in words else "an earlier result"
+        log.print(f"overwrites {shortened(str(words.get('command', seed)), 200)} in {folder}", soft_wrap=True)
+
+
 @contextmanager
 def compile_notice(log: Console) -> Iterator[None]:
     """Say what takes so long where Warp compiles kernels, or Numba functions, that are not in its cache."""
@@ -167,6 +181,9 @@ RATE_COLUMNS = {
 }
 """Key of a vehicle's metrics and heading."""
 
+CONTINUED = ("\n", "from\n", "at\n")
+"""Beginnings of headings that continue the column before."""
+
 VERDICTS = {
     "not_observable_s": "not observable",
     "carried_by_odometry_s": f"not observable now, but carried by odometry (within {CONVERGED.text})",
@@ -183,35 +200,58 @@ def number_table(names: Sequence[str], numbers: Sequence[str], gap: int = 1) -> 
     return table
 
 
-def metrics_table(vehicles: list[dict[str, Any]]) -> Table:
-    """Return one row per vehicle: initial error, times to settle and converge, steady errors, targets, NEES."""
-    table = number_table(["\nvehicle"], [heading for _, heading, _ in COLUMNS])
-    cells = [write([vehicle[key] for vehicle in vehicles]) for key, _, write in COLUMNS]
-    for vehicle, row in zip(vehicles, zip(*cells, strict=True), strict=True):
-        table.add_row(vehicle["vehicle"], *row)
-    return table
+def row_tables(
+    name: str, rows: Sequence[str], columns: Sequence[tuple[str, Sequence[str]]], width: int
+) -> Iterator[Table]:
+    """Yield one row per vehicle, in as many tables as it takes for the columns to fit into a width.
+
+    A heading of `CONTINUED` stays with the column before it.
+    """
+    groups: list[list[tuple[str, Sequence[str]]]] = []
+    for heading, cells in columns:
+        if not heading.startswith(CONTINUED):
+            groups.append([])
+        groups[-1].append((heading, cells))
+    parts: list[list[tuple[str, Sequence[str]]]] = []
+    names = used = max(len(line) for text in (name, *rows) for line in text.split("\n"))
+    for group in groups:
+        needed = sum(
+            2 + max(len(line) for text in (head, *cells) for line in text.split("\n")) for head, cells in group
+        )
+        if not parts or used + needed > width:
+            parts.append([])
+            used = names
+        parts[-1] += group
+        used += needed
+    for part in parts:
+        table = number_table([name], [heading for heading, _ in part])
+        for row in zip(rows, *(cells for _, cells in part), strict=True):
+            table.add_row(*row)
+        yield table
 
 
-def estimates_table(vehicles: list[dict[str, Any]]) -> Table:
-    """Return one row per vehicle without true poses: last estimate, standard deviations, targets."""
+def metrics_tables(vehicles: list[dict[str, Any]], width: int) -> Iterator[Table]:
+    """Yield one row per vehicle: initial error, times to settle and converge, steady errors, targets, NEES."""
+    columns = [(heading, write([vehicle[key] for vehicle in vehicles])) for key, heading, write in COLUMNS]
+    yield from row_tables("\nvehicle", [vehicle["vehicle"] for vehicle in vehicles], columns, width)
+
+
+def estimates_tables(vehicles: list[dict[str, Any]], width: int) -> Iterator[Table]:
+    """Yield one row per vehicle without true poses: last estimate, standard deviations, targets."""
     headings = ("ends at x\n[m]", "y\n[m]", "yaw\n[deg]", "std\n[m]", "\n[deg]", "targets\nseen")
-    table = number_table(["\nvehicle"], headings)
     ends = np.array([[*row["final_position_estimate_m"][:2], row["final_yaw_estimate_deg"]] for row in vehicles])
     keys = ("position_std_m", "orientation_std_deg", "mean_targets_in_view")
     cells = [*map(column, ends.T), *(column([row[key] for row in vehicles]) for key in keys)]
-    for vehicle, row in zip(vehicles, zip(*cells, strict=True), strict=True):
-        table.add_row(vehicle["vehicle"], *row)
-    return table
+    columns = [*zip(headings, cells, strict=True)]
+    yield from row_tables("\nvehicle", [vehicle["vehicle"] for vehicle in vehicles], columns, width)
 
 
-def rates(vehicles: list[dict[str, Any]]) -> Iterator[Table | str]:
+def rates(vehicles: list[dict[str, Any]], width: int) -> Iterator[Table | str]:
     """Yield the measured rates beside the theory's, and their meaning; nothing without a theory."""
     if all(math.isnan(vehicle["guaranteed_rate_per_s"]) for vehicle in vehicles):
         return
-    table = number_table(["rate\nvehicle"], [*RATE_COLUMNS.values()])
-    for vehicle in vehicles:
-        table.add_row(vehicle["vehicle"], *(number(vehicle[key], 3) for key in RATE_COLUMNS))
-    yield table
+    columns = [(text, [number(vehicle[key], 3) for vehicle in vehicles]) for key, text in RATE_COLUMNS.items()]
+    yield from row_tables("rate\nvehicle", [vehicle["vehicle"] for vehicle in vehicles], columns, width)
     yield "Guaranteed: the least of the run, in the norm of P. Frozen: k lambda_min(P M)."
     yield ""
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.api.arguments import STATE_LIMIT
+from coopenv.api.arguments import STATE_LIMIT, world_states
 from coopenv.api.make import make_vec
 from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.base.installation import install_command
@@ -63,7 +63,9 @@ class BatchedWorlds(EnvBase):
             mask=Categorical(2, rows, dtype=torch.bool),
             info=Composite({name: Unbounded(rows) for name in (*QUALITIES, *EVENTS)}, shape=rows),
         )
-        self.observation_spec["state"] = Bounded(-STATE_LIMIT, STATE_LIMIT, (worlds, *world_states(batch.engine.view, scenario).shape[1:]))
+        self.observation_spec["state"] = Bounded(
+            -STATE_LIMIT, STATE_LIMIT, (worlds, *world_states(batch.engine.view, scenario).shape[1:])
+        )
         self.action_spec = group(action=Bounded(-1.0, 1.0, (*rows, scenario.action_size)))
         self.reward_spec = group(reward=Unbounded((*rows, 1)))
         self.done_spec = group(**{name: Categorical(2, (*rows, 1), dtype=torch.bool) for name in FLAGS})

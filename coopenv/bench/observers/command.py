@@ -34,7 +34,7 @@ from coopenv.bench.observers.tables import (
     quality,
 )
 from coopenv.estimation.metrics import CONVERGED
-from coopenv.runs.console import Progress
+from coopenv.runs.console import Progress, note_overwritten
 from coopenv.viz import FORMATS
 
 JSON_FILE, CSV_FILE, REPORT_FILE, BASIN_FILE = "leaderboard.json", "leaderboard.csv", "report.html", "basin.csv"
@@ -78,6 +78,7 @@ def perform(
     names += [name for form in FORMATS for name in figure_files(tuple(plan.source.variants), form)]
     try:
         with nullcontext() if out is None else replacing_folder(out, names) as folder:
+            note_overwritten(out, JSON_FILE, log)
             for name, reason in plan.left_out.items():
                 log.print(f"left out: {name} ({reason})", soft_wrap=True, markup=False)
             with Progress(log, plan.work, total=1.0) as progress:
