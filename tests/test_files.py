@@ -362,3 +362,13 @@ def test_a_folder_that_is_held_is_waited_for_so_long(tmp_path: Path) -> None:
         descriptor = second.result(timeout=60)
     assert descriptor is not None
     os.close(descriptor)
+
+
+def test_a_second_run_into_a_folder_is_refused_in_one_line(tmp_path: Path) -> None:
+    with replacing_folder(tmp_path / "result", NAMES) as new:
+        (new / "a.txt").write_text("first")
+        with pytest.raises(OutputError, match="another run is writing its results there"):
+            write(tmp_path / "result", 1)
+        write(tmp_path / "beside", 1)
+    assert (tmp_path / "result" / "a.txt").read_text() == "first"
+    write(tmp_path / "result", 1)

@@ -236,9 +236,7 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
 @contextmanager
 def _alone(folder: str | Path, place: Path, part: Path) -> Iterator[None]:
     """Hold the folder `part` of a run. Raises OutputError: another run holds one for the same place."""
-    own = lock(
-        part, shared=True
-    )  # as files within do; before looking for others: of two runs at once, at least one finds the other
+    own = lock(part, shared=True)  # as files within do; of two runs at once, at least one then finds the other
     try:
         for other in place.parent.glob(_hidden(place, PART)) if own is not None else ():
             if other == part:

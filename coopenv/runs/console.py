@@ -98,7 +98,7 @@ class Progress:
     def line(self) -> str:
         """Return the progress of the work, e.g. `simulating: 40 % after 20 s, about 30 s left`."""
         elapsed, left, share = monotonic() - self._begin, self._left(), self._share
-        done = f"{100 * share:.0f} % after " if share else ""
+        done = f"{100 * share:.0f} % after " if 0.0 < share < 1.0 else "the last part, after " if share else ""
         rest = "" if isnan(left) else f", about {left:.0f} s left"
         return f"{self._description}: {done}{elapsed:.0f} s{rest}"
 
@@ -108,7 +108,7 @@ class Progress:
 
     def _left(self) -> float:
         """Return the time that the rest will take at the pace since the first part, s; NaN: not known yet."""
-        if self._first is None or not self._share <= 1.0:
+        if self._first is None or not self._share < 1.0:
             return nan
         left = (self._total or nan) - self._completed
         if self._rate is not None:

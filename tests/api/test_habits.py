@@ -426,6 +426,14 @@ def test_rendering_says_why_there_is_no_picture() -> None:
         coopenv.parallel_env(ENV, render_mode="rgb_array").render()
 
 
+def test_the_state_before_a_reset_is_refused() -> None:
+    for env in (coopenv.parallel_env(ENV), coopenv.make_vec(ENV, num_worlds=2)):
+        with pytest.raises(coopenv.CoopenvError, match=r"^state\(\) called before reset\(\)$"):
+            env.state()
+        env.reset(seed=0)
+        assert env.state().any()
+
+
 def test_classes_and_functions_are_agents() -> None:
     class Straight:
         def __init__(self, scenario: Scenario) -> None:

@@ -19,11 +19,12 @@ from rich.console import Console
 import coopenv
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.installation import data_directory
+from coopenv.base.terminal import Terminal
 from coopenv.cli.app import main
 from coopenv.estimation import compiled
 from coopenv.runs import console as module
 from coopenv.runs import scenario_text as words
-from coopenv.runs.console import Progress, compile_notice
+from coopenv.runs.console import Progress, compile_notice, note_overwritten, row_tables
 from coopenv.runs.scenario_text import IMAGE_FIELDS, settings
 from coopenv.runs.summary import describe_scenario
 from coopenv.scenario import parse_scenario
@@ -407,3 +408,23 @@ def test_what_is_drawn_is_described() -> None:
     ):
         assert said in text, said
     assert "[difficulty]" not in text
+
+
+def test_columns_that_do_not_fit_stand_in_a_further_table() -> None:
+    columns = [("start\n[m]", ["0.1"]), ("\n[deg]", ["4"]), ("RMSE\n[m]", ["0.2"])]
+    whole, [first, second] = (
+        [*row_tables("\nvehicle", ["vehicle_1"], columns, 40)],
+        [*row_tables("\nvehicle", ["vehicle_1"], columns, 25)],
+    )
+    assert len(whole) == 1
+    assert [column.header for column in first.columns] == ["\nvehicle", "start\n[m]", "\n[deg]"]
+    assert [column.header for column in second.columns] == ["\nvehicle", "RMSE\n[m]"]
+
+
+def test_an_overwritten_result_is_printed_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "metrics.json").write_text('{"seed": 3, "environment": "facade"}')
+    log = Terminal(width=200)
+    note_overwritten(tmp_path, "metrics.json", log)
+    note_overwritten(None, "metrics.json", log)
+    note_overwritten(tmp_path, "other.json", log)
+    assert capsys.readouterr().out == f"overwrites seed 3 of facade in {tmp_path}\n"
