@@ -223,16 +223,6 @@ def test_links_stay_links_and_modes_stay_modes(place: Path) -> None:
     assert (place / "to_folder").is_symlink() and (place / "to_file").is_symlink()
 
 
-def test_two_at_once_do_not_meet(place: Path) -> None:
-    with replacing_folder("result", NAMES) as first:
-        (first / "a.txt").write_text("1" * 20_000)
-        write("result", 4)
-        assert first.is_dir()
-        for name in NAMES[1:]:
-            (first / name).write_text("1" * 20_000)
-    assert generation_of(place / "result") == 1
-
-
 @pytest.mark.parametrize(
     ("folder", "reason"),
     [

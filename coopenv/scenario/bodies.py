@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import Field, field_serializer, field_validator, model_validator
 
+from coopenv.base import units
 from coopenv.base.sections import (
     NonNegative,
     NonNegativeVector3,
@@ -22,7 +23,6 @@ from coopenv.base.sections import (
     Word,
     parsed,
 )
-from coopenv.base.units import DRIVEN_SPEED, EXTENT, HEADING, LENGTH, PLACE, SPEED, TIME, TURN, TURN_RATE
 from coopenv.scenario.learning import Dynamics
 from coopenv.scenario.sensing import Camera, Faults, Noise
 
@@ -30,9 +30,9 @@ from coopenv.scenario.sensing import Camera, Faults, Noise
 class Body(Section):
     """An oriented box that occludes and collides."""
 
-    size: Annotated[PositiveVector3, LENGTH]
+    size: Annotated[PositiveVector3, units.LENGTH]
     """Length, width and height in m along the body's x, y and z axes."""
-    center: Annotated[Vector3, LENGTH] = (0.0, 0.0, 0.0)
+    center: Annotated[Vector3, units.LENGTH] = (0.0, 0.0, 0.0)
     """Centre of the box in the body frame, m."""
 
 
@@ -40,20 +40,20 @@ class Obstacle(Section):
     """A building: a box that stands still."""
 
     name: Word = Field(min_length=1, max_length=64)
-    center: Annotated[Vector3, PLACE]
+    center: Annotated[Vector3, units.PLACE]
     """Centre in the coordinates of this file, m."""
-    size: Annotated[PositiveVector3, EXTENT]
+    size: Annotated[PositiveVector3, units.EXTENT]
     """Length, width and height, m."""
-    yaw: Annotated[Number, HEADING] = 0.0
+    yaw: Annotated[Number, units.HEADING] = 0.0
     """Rotation about z, rad."""
 
 
 class Road(Section):
     """A straight strip drawn under the top view; it has no effect on the motion."""
 
-    start: Annotated[Vector2, PLACE]
-    end: Annotated[Vector2, PLACE]
-    width: Annotated[Positive, EXTENT]
+    start: Annotated[Vector2, units.PLACE]
+    end: Annotated[Vector2, units.PLACE]
+    width: Annotated[Positive, units.EXTENT]
     marked: bool = True
     """Draw a dashed line along the middle."""
 
@@ -68,20 +68,20 @@ class ConstantMotion(Section):
     """Keeps one body twist for ever."""
 
     kind: Literal["constant"] = "constant"
-    linear: Annotated[Vector3, SPEED]
+    linear: Annotated[Vector3, units.SPEED]
     """Linear velocity in the body frame, m/s."""
-    angular: Annotated[Vector3, TURN_RATE] = (0.0, 0.0, 0.0)
+    angular: Annotated[Vector3, units.TURN_RATE] = (0.0, 0.0, 0.0)
     """Angular velocity in the body frame, rad/s."""
 
 
 class TwistSegment(Section):
     """Constant body twist for a duration."""
 
-    duration: Annotated[Positive, TIME]
+    duration: Annotated[Positive, units.TIME]
     """s"""
-    linear: Annotated[Vector3, SPEED] = (0.0, 0.0, 0.0)
+    linear: Annotated[Vector3, units.SPEED] = (0.0, 0.0, 0.0)
     """Linear velocity in the body frame, m/s."""
-    angular: Annotated[Vector3, TURN_RATE] = (0.0, 0.0, 0.0)
+    angular: Annotated[Vector3, units.TURN_RATE] = (0.0, 0.0, 0.0)
     """Angular velocity in the body frame, rad/s."""
 
 
@@ -98,9 +98,9 @@ FASTEST = 1e6  # m/s, on average from one waypoint to the next
 class Waypoint(Section):
     """A place to be at a time."""
 
-    time: Annotated[NonNegative, TIME]
+    time: Annotated[NonNegative, units.TIME]
     """s"""
-    position: Annotated[Vector3, PLACE]
+    position: Annotated[Vector3, units.PLACE]
     """Position in the coordinates of this file, m."""
 
 
@@ -132,9 +132,9 @@ class DrivenMotion(Section):
     kind: Literal["driven"] = "driven"
     driver: Annotated[str, Field(min_length=1, max_length=1_000)] | None = None
     """Agent that drives it in place of actions: name, folder or `file.py:Class` (none: actions)."""
-    initial_speed: Annotated[Number, DRIVEN_SPEED] = 0.0
+    initial_speed: Annotated[Number, units.DRIVEN_SPEED] = 0.0
     """m/s"""
-    initial_speed_spread: Annotated[NonNegative, DRIVEN_SPEED] = 0.0
+    initial_speed_spread: Annotated[NonNegative, units.DRIVEN_SPEED] = 0.0
     """Half-width of a uniform deviation of it, m/s; the result is clipped to the limits of `[dynamics]`."""
 
 
@@ -166,15 +166,15 @@ def _has_one_orientation(given: Oriented) -> Oriented:
 class InitialPose(Section):
     """Start of an agent, fixed or drawn anew at each reset; an agent with routes starts on the drawn route."""
 
-    position: Annotated[Vector3 | None, PLACE] = None
+    position: Annotated[Vector3 | None, units.PLACE] = None
     """Position in the coordinates of this file, m; needed without routes."""
-    yaw: Annotated[Number | None, HEADING] = None
+    yaw: Annotated[Number | None, units.HEADING] = None
     """Rotation about z, rad (0 when neither yaw nor a quaternion is given)."""
     quaternion_wxyz: QuaternionWxyz | None = None
     """Full orientation, body to map."""
-    position_spread: Annotated[NonNegativeVector3, LENGTH] = (0.0, 0.0, 0.0)
+    position_spread: Annotated[NonNegativeVector3, units.LENGTH] = (0.0, 0.0, 0.0)
     """Half-widths of a uniform offset along the start's own x, y, z axes, m."""
-    yaw_spread: Annotated[NonNegative, TURN] = 0.0
+    yaw_spread: Annotated[NonNegative, units.TURN] = 0.0
     """Half-width of a uniform turn about the body's z axis, rad."""
 
     _one_orientation = model_validator(mode="after")(_has_one_orientation)
@@ -183,17 +183,17 @@ class InitialPose(Section):
 class InitialEstimate(Section):
     """The observer's estimate at t = 0, fixed or drawn anew at each reset."""
 
-    position: Annotated[Vector3 | None, PLACE] = None
+    position: Annotated[Vector3 | None, units.PLACE] = None
     """Estimated position in the coordinates of this file, m (default: the true one; an override says so by `true`)."""
-    position_offset: Annotated[Vector3, EXTENT] = (0.0, 0.0, 0.0)
+    position_offset: Annotated[Vector3, units.EXTENT] = (0.0, 0.0, 0.0)
     """Added to the estimated position, map axes, m."""
-    position_radius: Annotated[NonNegative, LENGTH] = 0.0
+    position_radius: Annotated[NonNegative, units.LENGTH] = 0.0
     """A further offset is drawn uniformly from a ball of this radius, m."""
     orientation_offset_wxyz: QuaternionWxyz = (1.0, 0.0, 0.0, 0.0)
     """Rhat(0) = R(0) Rot(offset)."""
-    orientation_angle: Annotated[NonNegative | Literal["uniform"], TURN] = 0.0
+    orientation_angle: Annotated[NonNegative | Literal["uniform"], units.TURN] = 0.0
     """A further turn about a random axis by an angle drawn from [0, this] rad; `uniform`: over SO(3)."""
-    yaw: Annotated[Number | None, HEADING] = None
+    yaw: Annotated[Number | None, units.HEADING] = None
     """Absolute estimated yaw, rad; replaces R(0) above."""
     quaternion_wxyz: QuaternionWxyz | None = None
     """Absolute estimated orientation; replaces R(0) above."""
@@ -211,9 +211,9 @@ class InitialEstimate(Section):
 class Goal(Section):
     """Goal of a driven vehicle. With routes, the goal is the end of the drawn route."""
 
-    position: Annotated[Vector3 | None, PLACE] = None
+    position: Annotated[Vector3 | None, units.PLACE] = None
     """Position in the coordinates of this file, m; needed without routes."""
-    radius: Annotated[Positive, LENGTH] = 0.5
+    radius: Annotated[Positive, units.LENGTH] = 0.5
     """The vehicle has arrived within this horizontal distance, m."""
 
 
@@ -221,9 +221,9 @@ class Landmark(Section):
     """A target whose position all vehicles know, static or moving."""
 
     name: str = Field(min_length=1, max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
-    position: Annotated[Vector3, PLACE]
+    position: Annotated[Vector3, units.PLACE]
     """Position (of its origin, at t = 0) in the coordinates of this file, m."""
-    position_spread: Annotated[NonNegativeVector3, EXTENT] = (0.0, 0.0, 0.0)
+    position_spread: Annotated[NonNegativeVector3, units.EXTENT] = (0.0, 0.0, 0.0)
     """Half-widths of a uniform offset along its own x, y, z axes, drawn at every reset, m; vehicles know it."""
     presence: Probability = 1.0
     """Chance that it is there, drawn at every reset; vehicles know."""
@@ -231,12 +231,12 @@ class Landmark(Section):
     """Half-width of a uniform factor about 1 of the pace of its motion, drawn at every reset."""
     group: str | None = None
     """The group of `landmark_groups` that draws its position; written by the group."""
-    yaw: Annotated[Number, HEADING] = 0.0
+    yaw: Annotated[Number, units.HEADING] = 0.0
     """Orientation of a moving landmark's body at t = 0, rad."""
     motion: LandmarkMotion = StaticMotion()
     body: Body | None = None
     """A landmark with a body occludes targets behind it."""
-    marker: Annotated[Vector3, LENGTH] = (0.0, 0.0, 0.0)
+    marker: Annotated[Vector3, units.LENGTH] = (0.0, 0.0, 0.0)
     """The point that cameras see, in the landmark's body frame, m."""
 
     @property
@@ -254,13 +254,13 @@ class Vehicle(Section):
     initial_estimate: InitialEstimate = InitialEstimate()
     motion: VehicleMotion = StaticMotion()
     body: Body | None = None
-    marker: Annotated[Vector3, LENGTH] = (0.0, 0.0, 0.0)
+    marker: Annotated[Vector3, units.LENGTH] = (0.0, 0.0, 0.0)
     """The point of this vehicle that other cameras see, in its body frame, m."""
     presence: Probability = 1.0
     """Chance that it is there, drawn at every reset; one vehicle is always left, a driven one where there is any."""
     pace_spread: Probability = 0.0
     """Half-width of a uniform factor about 1 of the pace of a prescribed motion, drawn at every reset."""
-    entry: Annotated[tuple[NonNegative, NonNegative] | None, TIME] = None
+    entry: Annotated[tuple[NonNegative, NonNegative] | None, units.TIME] = None
     """First and last time at which it appears at its start, drawn uniformly, s (none: at the reset). It waits until no
     other vehicle is near."""
     next_routes: tuple[str, ...] = Field(default=(), max_length=1000)
@@ -311,17 +311,17 @@ class Vehicle(Section):
 class Area(Section):
     """A rectangle whose sides are parallel to the axes."""
 
-    center: Annotated[Vector2, PLACE]
+    center: Annotated[Vector2, units.PLACE]
     """Centre in the coordinates of this file, m."""
-    half: Annotated[PositiveVector2, EXTENT]
+    half: Annotated[PositiveVector2, units.EXTENT]
     """Half of its sides along x and y, m."""
 
 
 class Line(Section):
     """A straight line."""
 
-    start: Annotated[Vector2, PLACE]
-    end: Annotated[Vector2, PLACE]
+    start: Annotated[Vector2, units.PLACE]
+    end: Annotated[Vector2, units.PLACE]
     """End in the coordinates of this file, m."""
 
 
@@ -332,7 +332,7 @@ class LandmarkGroup(Section):
     count: int = Field(ge=1, le=1000)
     boxes: tuple[Area, ...] = Field(default=(), max_length=1000)
     lines: tuple[Line, ...] = Field(default=(), max_length=1000)
-    height: Annotated[tuple[Number, Number], EXTENT]
+    height: Annotated[tuple[Number, Number], units.EXTENT]
     """Lowest and highest z, m."""
     presence: Probability = 1.0
     """Chance that a landmark of the group is there, drawn for each."""

@@ -5,8 +5,8 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, JsonValue
 
+from coopenv.base import units
 from coopenv.base.sections import NonNegative, Positive, Section, Word
-from coopenv.base.units import CLOCK, EXTENT, TIME
 
 File = Annotated[str, Field(min_length=1, max_length=1_000)]
 """A path; a relative one is looked for beside the scenario's file."""
@@ -65,19 +65,19 @@ class Sumo(Cosimulator):
     """Routes, trips and flows (`.rou.xml`)."""
     additional: tuple[File, ...] = Field(default=(), max_length=100)
     """Further files (`.add.xml`): polygons, points of interest, types of vehicles."""
-    begin: Annotated[NonNegative, CLOCK] = 0.0
+    begin: Annotated[NonNegative, units.CLOCK] = 0.0
     """SUMO's time at which the traffic begins, s."""
-    warm_up: Annotated[NonNegative, TIME] = 60.0
+    warm_up: Annotated[NonNegative, units.TIME] = 60.0
     """Traffic before the episode begins, s."""
     posts: bool = True
     """Place a landmark beside the stop line of every road into a junction: at the right, left where traffic is."""
-    post_height: Annotated[Positive, EXTENT] = 3.0
+    post_height: Annotated[Positive, units.EXTENT] = 3.0
     """m"""
     landmarks: Word = "landmark"
     """Points of interest whose type begins so are landmarks, at their parameter `height` or `post_height`."""
     buildings: Word = "building"
     """Polygons whose type begins so are obstacles, up to their parameter `height` or `building_height`."""
-    building_height: Annotated[Positive, EXTENT] = 10.0
+    building_height: Annotated[Positive, units.EXTENT] = 10.0
     """m"""
     options: dict[str, JsonValue] = Field(default={})
     """SUMO's own options by name, without options that follow from settings of this file."""

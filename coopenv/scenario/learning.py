@@ -6,23 +6,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, ConfigDict, Field, create_model, model_validator
 
+from coopenv.base import units
 from coopenv.base.errors import listed, suggest
 from coopenv.base.sections import NonNegative, Number, Positive, Probability, Section
-from coopenv.base.units import (
-    ACCELERATION,
-    DISTANCE,
-    DRIVEN_SPEED,
-    EXTENT,
-    LAG,
-    LENGTH,
-    PLACE,
-    SPEED,
-    SPEED_ERROR,
-    STEERING,
-    TIME,
-    TURN,
-    TURN_RATE,
-)
 from coopenv.scenario.terms import (
     GROUPS,
     OBSERVATION_FIELDS,
@@ -50,19 +36,19 @@ class Observation(Section):
     """Groups and fields that are removed again, for an ablation."""
     planar: bool = False
     """Omit heights, roll and pitch, which a vehicle on a plane cannot change."""
-    position_scale: Annotated[Positive, PLACE] = 50.0
+    position_scale: Annotated[Positive, units.PLACE] = 50.0
     """m, of positions and distances"""
-    velocity_scale: Annotated[Positive, SPEED] = 5.0
+    velocity_scale: Annotated[Positive, units.SPEED] = 5.0
     """m/s, of measured velocities"""
-    angular_velocity_scale: Annotated[Positive, TURN_RATE] = 3.0
+    angular_velocity_scale: Annotated[Positive, units.TURN_RATE] = 3.0
     """rad/s, of measured angular velocities"""
-    age_scale: Annotated[Positive, TIME] = 1.0
+    age_scale: Annotated[Positive, units.TIME] = 1.0
     """s; older measurements read 1"""
-    map_scale: Annotated[Positive, DISTANCE] = 10.0
+    map_scale: Annotated[Positive, units.DISTANCE] = 10.0
     """m, of landmarks of the map"""
     map_size: int = Field(default=8, ge=1, le=256)
     """Number of map landmarks in the fields per landmark: the nearest to the vehicle's own estimate."""
-    route_step: Annotated[Positive, EXTENT] = 0.5
+    route_step: Annotated[Positive, units.EXTENT] = 0.5
     """m; `route_ahead` shows the way so far ahead, and twice, four and eight times as far"""
     scales: dict[str, Positive] = Field(default={})
     """Scales of single fields by name, in place of their own."""
@@ -91,25 +77,25 @@ class Observation(Section):
 class Dynamics(Section):
     """Kinematic bicycle with its actuators; the defaults are a SVEA car's."""
 
-    wheelbase: Annotated[Positive, LENGTH] = 0.324
+    wheelbase: Annotated[Positive, units.LENGTH] = 0.324
     """m, from the rear to the front axle"""
-    max_speed: Annotated[Positive, DRIVEN_SPEED] = 1.53
+    max_speed: Annotated[Positive, units.DRIVEN_SPEED] = 1.53
     """m/s, forwards"""
     reverse: bool = False
     """Allow negative speeds."""
-    max_acceleration: Annotated[Positive, ACCELERATION] = 2.0
+    max_acceleration: Annotated[Positive, units.ACCELERATION] = 2.0
     """m/s^2"""
-    max_steering: Annotated[float, Field(gt=0.0, lt=1.5), STEERING] = 0.6981317007977318
+    max_steering: Annotated[float, Field(gt=0.0, lt=1.5), units.STEERING] = 0.6981317007977318
     """rad, to either side"""
-    max_steering_rate: Annotated[Positive, TURN_RATE] = 2.0
+    max_steering_rate: Annotated[Positive, units.TURN_RATE] = 2.0
     """rad/s"""
-    speed_time_constant: Annotated[NonNegative, LAG] = 0.1
+    speed_time_constant: Annotated[NonNegative, units.LAG] = 0.1
     """First-order lag of the drive, s."""
-    steering_time_constant: Annotated[NonNegative, LAG] = 0.05
+    steering_time_constant: Annotated[NonNegative, units.LAG] = 0.05
     """First-order lag of the steering, s."""
-    latency: Annotated[NonNegative, LAG] = 0.0
+    latency: Annotated[NonNegative, units.LAG] = 0.0
     """Dead time between a decision and its effect, s; at most one decision period."""
-    dead_band: Annotated[NonNegative, SPEED_ERROR] = 0.0
+    dead_band: Annotated[NonNegative, units.SPEED_ERROR] = 0.0
     """Speed commands of a smaller magnitude do not move the car, as its speed controller has them, m/s."""
     gated: bool = False
     """Limit the change of commands between decisions by the acceleration and `max_steering_rate`, as the gate of a SVEA
@@ -125,9 +111,9 @@ class Dynamics(Section):
 class Pan(Section):
     """A camera that turns about its own centre and the body's z axis; the vehicle knows the angle."""
 
-    limit: Annotated[float, Field(gt=0.0, le=math.pi), TURN]
+    limit: Annotated[float, Field(gt=0.0, le=math.pi), units.TURN]
     """Largest angle to either side, rad; an entry of 1 asks for it (positive turns left)."""
-    rate: Annotated[Positive, TURN_RATE]
+    rate: Annotated[Positive, units.TURN_RATE]
     """Largest angular rate, rad/s."""
 
 
@@ -136,7 +122,7 @@ class Action(Section):
 
     longitudinal: Literal["speed", "acceleration"] = "speed"
     """`speed`: -1..1 spans the permitted speeds (0 or -max .. max); `acceleration`: times max_acceleration."""
-    steering: Annotated[Positive | None, STEERING] = None
+    steering: Annotated[Positive | None, units.STEERING] = None
     """Steering angle at action 1, rad (none: max_steering)."""
     pan: Pan | None = None
     """None: cameras do not turn."""
@@ -179,9 +165,9 @@ class Reward(Section):
     vehicles, the least over the vehicles under way."""
     own_share: Probability = 0.0
     """Share of a vehicle's own weighted sum in its reward with a team; the rest is the team's."""
-    uncertainty_threshold: Annotated[NonNegative, LENGTH] = 0.02
+    uncertainty_threshold: Annotated[NonNegative, units.LENGTH] = 0.02
     """Threshold, m; terms per metre count the excess"""
-    uncertainty_cap: Annotated[Positive, EXTENT] = 1.0
+    uncertainty_cap: Annotated[Positive, units.EXTENT] = 1.0
     """Largest counted excess, m; also the price of a metre that is never driven"""
     observability_floor: Positive = 1e-5
     """Addition to the smallest eigenvalue of the sliding Gramian before the logarithm: above the rounding of 0"""
@@ -219,7 +205,7 @@ class Termination(Section):
     """Touching a building or another body ends the vehicle's episode."""
     arrival: bool = True
     """Reaching its goal ends the vehicle's episode."""
-    off_route: Annotated[Positive | None, EXTENT] = None
+    off_route: Annotated[Positive | None, units.EXTENT] = None
     """A vehicle that is so far beside its route, or beyond an end of it, has left the road, and its episode ends, m."""
     after_arrival: Literal["park", "leave", "continue", "transit"] = "park"
     """`park`: a vehicle that has arrived stands where it is; `leave`: it is gone from the next camera tick on;

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from coopenv.base import units
 from coopenv.base.sections import NonNegative, Positive, Section, Vector2
-from coopenv.base.units import DISTANCE, EXTENT, LENGTH, PLACE, TIME
 from coopenv.scenario.bodies import ConstantMotion, Landmark, SegmentMotion, Vehicle, WaypointMotion
 from coopenv.scenario.sensing import rotation_of
 
@@ -45,13 +45,13 @@ class Pieces:
 class Signal(Section):
     """A traffic light with a fixed cycle, which the model of traffic obeys."""
 
-    at: Annotated[NonNegative, DISTANCE]
+    at: Annotated[NonNegative, units.DISTANCE]
     """Arc length of the stop line on the route as designed, m."""
-    period: Annotated[Positive, TIME]
+    period: Annotated[Positive, units.TIME]
     """Duration of a cycle, s."""
-    start: Annotated[NonNegative, TIME] = 0.0
+    start: Annotated[NonNegative, units.TIME] = 0.0
     """Begin of the green time in every cycle, s."""
-    green: Annotated[NonNegative, TIME]
+    green: Annotated[NonNegative, units.TIME]
     """Duration of the green time, s."""
 
 
@@ -59,15 +59,15 @@ class Route(Section):
     """A way that vehicles are to go, of which every reset draws a variant."""
 
     name: str = Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
-    waypoints: Annotated[tuple[Vector2, ...], PLACE] = Field(min_length=2, max_length=1000)
+    waypoints: Annotated[tuple[Vector2, ...], units.PLACE] = Field(min_length=2, max_length=1000)
     """x and y in the coordinates of this file, m; the route lies at z = 0 and must not come near itself."""
-    corner_radius: Annotated[NonNegative, EXTENT] = 0.0
+    corner_radius: Annotated[NonNegative, units.EXTENT] = 0.0
     """Radius of the arcs that round the corners, m."""
-    lateral_spread: Annotated[NonNegative, LENGTH] = 0.0
+    lateral_spread: Annotated[NonNegative, units.LENGTH] = 0.0
     """Half-width of a uniform sideways shift of the whole route, m."""
-    wander: Annotated[NonNegative, LENGTH] = 0.0
+    wander: Annotated[NonNegative, units.LENGTH] = 0.0
     """Largest further sideways deviation, m: two waves with random phases, which vanish at both ends."""
-    start_spread: Annotated[NonNegative, DISTANCE] = 0.0
+    start_spread: Annotated[NonNegative, units.DISTANCE] = 0.0
     """The start is drawn uniformly along the first so many metres."""
     signal: Signal | None = None
 

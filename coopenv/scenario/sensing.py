@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
+from coopenv.base import units
 from coopenv.base.errors import shown
 from coopenv.base.sections import (
     Direction,
@@ -26,24 +27,6 @@ from coopenv.base.sections import (
     TagFamily,
     Vector2,
     Vector3,
-)
-from coopenv.base.units import (
-    DETAIL,
-    DISTANCE,
-    DRIVEN_SPEED,
-    EXTENT,
-    FOCAL_LENGTH,
-    FREQUENCY,
-    LAG,
-    LENGTH,
-    PIXELS,
-    PLACE,
-    SHARE,
-    SMALL_ANGLE,
-    SPEED_ERROR,
-    TIME,
-    TURN,
-    TURN_RATE_ERROR,
 )
 
 PerAxis = NonNegative | NonNegativeVector3
@@ -89,15 +72,15 @@ class Camera(Section):
     model: Annotated[Literal["pinhole", "omnidirectional"], BeforeValidator(_known_model)] = "omnidirectional"
     """`omnidirectional` sees in every direction; `pinhole` is bounded by its image. The model, range, distortion
     and quantisation matter only where `topology.mode` is `sensed`; with `fixed` every neighbour is always measured."""
-    position: Annotated[Vector3, LENGTH] = (0.0, 0.0, 0.0)
+    position: Annotated[Vector3, units.LENGTH] = (0.0, 0.0, 0.0)
     """Optical centre in the body frame, m."""
     orientation: Literal["forward", "body"] | QuaternionWxyz = "forward"
     """Camera to body: `forward` looks along the body's x axis, `body` has the body's own axes."""
     image_size: tuple[Pixels, Pixels] = (316, 208)
     """Width and height, pixels."""
-    focal_length: Annotated[PositiveVector2, FOCAL_LENGTH] = (213.161906, 213.521038)
+    focal_length: Annotated[PositiveVector2, units.FOCAL_LENGTH] = (213.161906, 213.521038)
     """fx and fy, pixels."""
-    principal_point: Annotated[Vector2, PIXELS] = (154.841998, 114.98398)
+    principal_point: Annotated[Vector2, units.PIXELS] = (154.841998, 114.98398)
     """cx and cy, pixels."""
     distortion: tuple[Number, Number, Number, Number, Number] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3 of the plumb-bob model."""
@@ -105,16 +88,16 @@ class Camera(Section):
     """Compute bearings from undistorted pixels."""
     quantise: bool = False
     """Round detections to whole pixels."""
-    range: Annotated[Positive | None, DISTANCE] = None
+    range: Annotated[Positive | None, units.DISTANCE] = None
     """Farthest distance at which a target is detected, m (none: unlimited)."""
     miss_probability: Probability = 0.0
     """Chance that a detection in view is lost, drawn per target and frame."""
-    extrinsics_error: Annotated[NonNegative, SMALL_ANGLE] = 0.0
+    extrinsics_error: Annotated[NonNegative, units.SMALL_ANGLE] = 0.0
     """Standard deviation per axis of a rotation by which the true camera is turned against `orientation`, rad; drawn
     per vehicle and episode. Observers know `orientation` alone."""
-    extrinsics_position_error: Annotated[NonNegative, DETAIL] = 0.0
+    extrinsics_position_error: Annotated[NonNegative, units.DETAIL] = 0.0
     """Likewise of where the optical centre is, per axis, m."""
-    focal_length_error: Annotated[NonNegative, SHARE] = 0.0
+    focal_length_error: Annotated[NonNegative, units.SHARE] = 0.0
     """Standard deviation of e: the true focal length is (1 + e) times the known one, so that the coordinates of a
     bearing on the image plane (at distance 1) are (1 + e) times what they should be; drawn per vehicle and episode."""
 
@@ -136,7 +119,7 @@ class Images(Section):
     family: TagFamily = "tag36h11"
     """Family of the tags: `tag16h5` to `tag36h11` of AprilTag, `DICT_4X4_50` to `DICT_7X7_1000` of ArUco. Numbers are
     those of the targets, landmarks first, from 0 on."""
-    side: Annotated[Positive, DETAIL] = 0.16
+    side: Annotated[Positive, units.DETAIL] = 0.16
     """Of the black squares, m."""
     blur: Annotated[float, Field(ge=0.0, le=50.0)] = 0.5
     """Standard deviation of the blur, pixels."""
@@ -150,13 +133,13 @@ class Images(Section):
 class Rates(Section):
     """Rates in Hz; the sensors are asynchronous."""
 
-    camera: Annotated[Rate, FREQUENCY] = 60.0
+    camera: Annotated[Rate, units.FREQUENCY] = 60.0
     """Frames per second; one frame is one tick."""
-    odometry: Annotated[Rate, FREQUENCY] = 100.0
+    odometry: Annotated[Rate, units.FREQUENCY] = 100.0
     """Samples of the body twist per second, each held until the next."""
-    observer: Annotated[Rate | None, FREQUENCY] = None
+    observer: Annotated[Rate | None, units.FREQUENCY] = None
     """Rate of the observer's corrections (none: at every camera frame)."""
-    decision: Annotated[Rate, FREQUENCY] = 10.0
+    decision: Annotated[Rate, units.FREQUENCY] = 10.0
     """Rate of the policy's actions; the camera rate must be a multiple."""
 
     @model_validator(mode="after")
@@ -176,11 +159,11 @@ class BearingNoise(Section):
     model: Literal["paper", "isotropic"] = "isotropic"
     """`paper`: uniform noise on the coordinates of the image plane across `axis`; `isotropic`: Gaussian in
     the tangent plane of the bearing."""
-    scale: Annotated[NonNegative, SMALL_ANGLE] = 0.0
+    scale: Annotated[NonNegative, units.SMALL_ANGLE] = 0.0
     """`paper`: largest deviation (image plane at distance 1); `isotropic`: standard deviation per axis, rad."""
     axis: Direction = (0.0, 0.0, 1.0)
     """Optical axis of the paper's formula, in the camera frame."""
-    rate: Annotated[Rate | Sample, FREQUENCY] = "sample"
+    rate: Annotated[Rate | Sample, units.FREQUENCY] = "sample"
     """Camera rate in Hz at which the scale holds (other rates keep its density), or `sample`: at any rate."""
 
 
@@ -189,11 +172,11 @@ class Slip(Section):
 
     rate: NonNegative = 0.0
     """Slips begin so often, 1/s."""
-    duration: Annotated[Positive, LAG] = 0.5
+    duration: Annotated[Positive, units.LAG] = 0.5
     """Mean duration, s; durations are exponentially distributed."""
     size: NonNegative = 0.3
     """Largest share by which the measured speed is too high, drawn uniformly per slip."""
-    angle: Annotated[NonNegative, TURN] = 0.0
+    angle: Annotated[NonNegative, units.TURN] = 0.0
     """Largest angle between the measured and the true direction of travel, drawn uniformly per slip, to either side,
     rad."""
 
@@ -203,21 +186,21 @@ class Noise(Section):
 
     enabled: bool = True
     """False switches off all noise and errors of odometry, bearings and cameras."""
-    velocity: Annotated[NonNegative, SPEED_ERROR] = 0.0
+    velocity: Annotated[NonNegative, units.SPEED_ERROR] = 0.0
     """Standard deviation of each component of a linear velocity sample, m/s."""
-    angular_velocity: Annotated[NonNegative, TURN_RATE_ERROR] = 0.0
+    angular_velocity: Annotated[NonNegative, units.TURN_RATE_ERROR] = 0.0
     """Standard deviation of each component of an angular velocity sample, rad/s."""
-    odometry_rate: Annotated[Rate | Sample, FREQUENCY] = "sample"
+    odometry_rate: Annotated[Rate | Sample, units.FREQUENCY] = "sample"
     """Odometry rate in Hz at which these hold (other rates keep their density), or `sample`: at any rate."""
     bearing: BearingNoise = BearingNoise()
-    odometry_scale: Annotated[NonNegative, SHARE] = 0.0
+    odometry_scale: Annotated[NonNegative, units.SHARE] = 0.0
     """Standard deviation of a scale error s, drawn per vehicle and episode: measured is (1 + s) times the velocity."""
-    odometry_scale_walk: Annotated[NonNegative, SHARE] = 0.0
+    odometry_scale_walk: Annotated[NonNegative, units.SHARE] = 0.0
     """Random walk of the scale, standard deviation per square root of a second."""
-    gyro_bias: Annotated[PerAxis, TURN_RATE_ERROR] = 0.0
+    gyro_bias: Annotated[PerAxis, units.TURN_RATE_ERROR] = 0.0
     """Standard deviation of a bias of the measured angular velocity, drawn per vehicle and episode, rad/s: of each
     component, or of the three body axes ([0, 0, x]: a car whose roll and pitch rates an accelerometer corrects)."""
-    gyro_bias_walk: Annotated[PerAxis, TURN_RATE_ERROR] = 0.0
+    gyro_bias_walk: Annotated[PerAxis, units.TURN_RATE_ERROR] = 0.0
     """Random walk of the bias, standard deviation, rad/s per square root of a second."""
     slip: Slip = Slip()
 
@@ -253,9 +236,9 @@ class V2x(Section):
     """Camera ticks between messages."""
     loss: Loss = 0.0
     """Chance that one receiver loses one message."""
-    range: Annotated[Positive | None, DISTANCE] = None
+    range: Annotated[Positive | None, units.DISTANCE] = None
     """Farthest distance at which messages are received, m (none: unlimited)."""
-    staleness: Annotated[Positive | None, TIME] = None
+    staleness: Annotated[Positive | None, units.TIME] = None
     """Messages older than this are not used, s (none: used for ever)."""
 
 
@@ -273,11 +256,11 @@ class ObserverSettings(Section):
     """V = diag(V[0] I3, V[1] I3) over (2 lambda, p)."""
     P0: PositiveVector2 = (1.0, 100.0)
     """P(0) = diag(P0[0] I3, P0[1] I3)."""
-    max_turn: Annotated[Positive, TURN] = 0.05
+    max_turn: Annotated[Positive, units.TURN] = 0.05
     """The correction is re-linearised whenever the attitude has turned by this much within a tick, rad."""
-    gramian_window: Annotated[float, Field(gt=0.0, le=3600.0), TIME] = 1.0
+    gramian_window: Annotated[float, Field(gt=0.0, le=3600.0), units.TIME] = 1.0
     """Length of the sliding window of the observability Gramian, s."""
-    gramian_distance: Annotated[Positive | None, DISTANCE] = None
+    gramian_distance: Annotated[Positive | None, units.DISTANCE] = None
     """Length of the window in m driven forwards by odometry, in place of a time (none)."""
 
     @model_validator(mode="after")
@@ -297,9 +280,9 @@ class Restart(Section):
 
     chance: Probability = 0.0
     """Probability that the vehicle restarts in an episode."""
-    time: Annotated[NonNegative, TIME] = 0.0
+    time: Annotated[NonNegative, units.TIME] = 0.0
     """When, s; it takes place at the next decision, never in the first one."""
-    time_spread: Annotated[NonNegative, TIME] = 0.0
+    time_spread: Annotated[NonNegative, units.TIME] = 0.0
     """Largest delay of the time, drawn uniformly, s."""
 
 
@@ -308,11 +291,11 @@ class Corruption(Section):
 
     probability: Probability = 0.0
     """Probability of each message, for all its receivers."""
-    start: Annotated[NonNegative, TIME] = 0.0
+    start: Annotated[NonNegative, units.TIME] = 0.0
     """Time of the start, s."""
-    size: Annotated[NonNegative, EXTENT] = 10.0
+    size: Annotated[NonNegative, units.EXTENT] = 10.0
     """Largest deviation of each coordinate of the position, m."""
-    turn: Annotated[NonNegative, TURN] = 1.0
+    turn: Annotated[NonNegative, units.TURN] = 1.0
     """Largest component of the rotation vector by which the orientation is turned, rad."""
 
 
@@ -324,19 +307,19 @@ class Lie(Section):
     before, as if it were new; `collude`: as `jump`, and all that collude are off by the same, drawn once for them."""
     chance: Probability = 1.0
     """Probability that the vehicle lies in an episode; drawn once for all colluding vehicles."""
-    start: Annotated[NonNegative, TIME] = 0.0
+    start: Annotated[NonNegative, units.TIME] = 0.0
     """Time of the start, s."""
-    start_spread: Annotated[NonNegative, TIME] = 0.0
+    start_spread: Annotated[NonNegative, units.TIME] = 0.0
     """Largest delay of the start, drawn uniformly (once for all colluding vehicles), s."""
-    offset: Annotated[NonNegative, EXTENT] = 5.0
+    offset: Annotated[NonNegative, units.EXTENT] = 5.0
     """Offset of `jump` and `collude`, m."""
-    turn: Annotated[NonNegative, TURN] = 0.0
+    turn: Annotated[NonNegative, units.TURN] = 0.0
     """Turn of all kinds but `replay`: about the vehicle's z axis, added to its attitude, rad."""
     odometry: Literal["consistent", "honest"] = "consistent"
     """Odometry in its messages, if any: `consistent` with the lie, or `honest`, the vehicle's own."""
-    speed: Annotated[Positive, DRIVEN_SPEED] = 0.05
+    speed: Annotated[Positive, units.DRIVEN_SPEED] = 0.05
     """Speed of `drift`, m/s."""
-    age: Annotated[Annotated[float, Field(gt=0.0, le=LONGEST_REPLAY)], LAG] = 1.0
+    age: Annotated[Annotated[float, Field(gt=0.0, le=LONGEST_REPLAY)], units.LAG] = 1.0
     """Age of the messages of `replay`, s; rounded to whole periods of the radio."""
     direction: Direction | None = None
     """Direction of the offset of the position, map axes, of any length (default: horizontal, drawn)."""
@@ -351,15 +334,15 @@ class MapError(Section):
     """Probability that an entry is wrong in an episode, drawn per landmark."""
     landmark: str | None = Field(default=None, max_length=64)
     """Name of the landmark (default: any may be wrong)."""
-    offset: Annotated[NonNegative, EXTENT] = 1.0
+    offset: Annotated[NonNegative, units.EXTENT] = 1.0
     """Distance of the position on the map from the true one, m."""
-    offset_spread: Annotated[NonNegative, EXTENT] = 0.0
+    offset_spread: Annotated[NonNegative, units.EXTENT] = 0.0
     """Largest increase of the offset, drawn uniformly, m."""
     direction: Direction | None = None
     """Direction of the offset, map axes, of any length (default: horizontal, drawn per landmark)."""
-    start: Annotated[NonNegative, TIME] = 0.0
+    start: Annotated[NonNegative, units.TIME] = 0.0
     """Time of the start, s; the position is right before it."""
-    start_spread: Annotated[NonNegative, TIME] = 0.0
+    start_spread: Annotated[NonNegative, units.TIME] = 0.0
     """Largest delay of the start, drawn uniformly per landmark, s."""
 
 
@@ -368,17 +351,17 @@ class Jammer(Section):
 
     chance: Probability = 0.0
     """Probability that the vehicle has a jammer in an episode."""
-    range: Annotated[Positive | None, DISTANCE] = None
+    range: Annotated[Positive | None, units.DISTANCE] = None
     """Range, m (none: unlimited)."""
-    position: Annotated[Vector3 | None, PLACE] = None
+    position: Annotated[Vector3 | None, units.PLACE] = None
     """Fixed place of the jammer, m (default: it moves with the vehicle)."""
-    start: Annotated[NonNegative, TIME] = 0.0
+    start: Annotated[NonNegative, units.TIME] = 0.0
     """Time of the start, s."""
-    start_spread: Annotated[NonNegative, TIME] = 0.0
+    start_spread: Annotated[NonNegative, units.TIME] = 0.0
     """Largest delay of the start, drawn uniformly, s."""
-    duration: Annotated[Positive | None, TIME] = None
+    duration: Annotated[Positive | None, units.TIME] = None
     """Duration, s (none: to the end)."""
-    period: Annotated[Positive, TIME] = 1.0
+    period: Annotated[Positive, units.TIME] = 1.0
     """Period of a periodic jammer, s."""
     duty: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
     """Share of each period in which it jams, from the period's start on; 1: a constant jammer."""
@@ -387,7 +370,7 @@ class Jammer(Section):
 class Faults(Section):
     """Faults of a vehicle's computer, clock, map and messages."""
 
-    clock_offset: Annotated[NonNegative, LAG] = 0.0
+    clock_offset: Annotated[NonNegative, units.LAG] = 0.0
     """Standard deviation of the vehicle's clock offset, s. Messages seem older or newer by the difference of
     the sender's clock and the receiver's, to whole camera ticks, but never from the future."""
     restart: Restart = Restart()

@@ -12,9 +12,9 @@ from typing import Annotated, Any, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
+from coopenv.base import units
 from coopenv.base.errors import ScenarioError
 from coopenv.base.sections import NonNegative, Positive, PositiveVector2, Section, validated
-from coopenv.base.units import DISTANCE, EXTENT, LENGTH, TIME, warn_of_implausible
 
 Point = tuple[float, float, float]
 
@@ -173,23 +173,23 @@ class Streets(Section):
 
     blocks: tuple[Count, Count]
     """Blocks along x and y."""
-    block: Annotated[Annotated[float, Field(ge=40.0, le=1000.0)], DISTANCE] = 80.0
+    block: Annotated[Annotated[float, Field(ge=40.0, le=1000.0)], units.DISTANCE] = 80.0
     """m, from one street's axis to the next."""
-    lane: Annotated[Annotated[float, Field(ge=2.5, le=5.0)], LENGTH] = 3.5
+    lane: Annotated[Annotated[float, Field(ge=2.5, le=5.0)], units.LENGTH] = 3.5
     """Width of a lane, m."""
-    pavement: Annotated[Annotated[float, Field(ge=0.5, le=6.0)], LENGTH] = 3.0
+    pavement: Annotated[Annotated[float, Field(ge=0.5, le=6.0)], units.LENGTH] = 3.0
     """Distance from a street to the buildings, m."""
-    height: Annotated[Positive, EXTENT] = 12.0
+    height: Annotated[Positive, units.EXTENT] = 12.0
     """Height of the buildings, m."""
     signs: Annotated[int, Field(ge=1, le=1000)] = 4
     """Landmarks per block, drawn along its facades."""
-    sign_height: Annotated[PositiveVector2, EXTENT] = (2.0, 5.0)
+    sign_height: Annotated[PositiveVector2, units.EXTENT] = (2.0, 5.0)
     """Lowest and highest z, m."""
-    period: Annotated[Positive, TIME] = 28.0
+    period: Annotated[Positive, units.TIME] = 28.0
     """Period of the signals, s."""
-    clearance: Annotated[NonNegative, TIME] = 4.0
+    clearance: Annotated[NonNegative, units.TIME] = 4.0
     """Time between green phases, s."""
-    lateral_spread: Annotated[NonNegative, LENGTH] = 0.2
+    lateral_spread: Annotated[NonNegative, units.LENGTH] = 0.2
     """Lateral spread of the routes, m."""
 
     @model_validator(mode="after")
@@ -211,7 +211,7 @@ def with_streets(raw: Mapping[str, Any], where: str) -> dict[str, Any]:
     if STREETS_KEY not in filled:
         return filled
     streets = validated(Streets, filled.pop(STREETS_KEY), f"{where}: {STREETS_KEY}", ScenarioError)
-    warn_of_implausible(streets, {}, STREETS_KEY)
+    units.warn_of_implausible(streets, {}, STREETS_KEY)
     made = {"roads": _roads(streets), "obstacles": _buildings(streets), "landmark_groups": _signs(streets)}
     for key, tables in {**made, "routes": _routes(streets), "vehicles": iter(())}.items():
         if not isinstance(filled.get(key, []), list):
