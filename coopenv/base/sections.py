@@ -5,7 +5,7 @@ import inspect
 import math
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from difflib import get_close_matches
 from functools import cache, reduce
@@ -228,14 +228,18 @@ def parsed(model: type[Model], raw: Any) -> Model:
 
 @cache
 def _failing_fast(model: type[BaseModel]) -> SchemaValidator:
-    def changed(node: Any) -> Any:
-        if isinstance(node, dict):
-            more = {"fail_fast": True} if node.get("type") in ("list", "tuple", "set") else {}
-            return {key: changed(value) for key, value in node.items()} | more
-        return type(node)(map(changed, node)) if type(node) in (list, tuple) else node
+    def changed(node: dict[str, Any]) -> dict[str, Any]:
+        return node | {"fail_fast": True} if node.get("type") in ("list", "tuple", "set") else node
 
     model.model_rebuild()  # builds what is deferred
-    return SchemaValidator(changed(model.__pydantic_core_schema__))
+    return SchemaValidator(rewritten(model.__pydantic_core_schema__, changed))
+
+
+def rewritten(node: Any, change: Callable[[dict[str, Any]], Any]) -> Any:
+    """Return a schema with each of its tables changed, the innermost first."""
+    if isinstance(node, dict):
+        return change({key: rewritten(part, change) for key, part in node.items()})
+    return type(node)(rewritten(part, change) for part in node) if type(node) in (list, tuple) else node
 
 
 TOO_DEEP = "lists or tables stand too deep in one another"

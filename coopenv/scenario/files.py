@@ -14,6 +14,7 @@ from coopenv.base.errors import ScenarioError, explained, shown
 from coopenv.base.format import plain
 from coopenv.base.installation import is_scene, scenario_path
 from coopenv.base.sections import MOST_BYTES, TOO_DEEP, Section, read_toml, validated
+from coopenv.base.units import TEXTS
 from coopenv.scenario.bodies import with_groups
 from coopenv.scenario.own_terms import located
 from coopenv.scenario.scenes import MOST_VEHICLES, scene_text
@@ -98,9 +99,11 @@ Scenario.__replace__ = lambda self, **changes: load_scenario(self, changes)
 
 def _data(value: Any) -> Any:
     """Return a copy of an entry, sections and their lists as plain data."""
-    if isinstance(value, tuple):
+    if isinstance(value, list | tuple):
         return [_data(entry) for entry in value]
-    return value.model_dump(mode="json", exclude_unset=True) if isinstance(value, Section) else deepcopy(value)
+    if isinstance(value, Mapping):
+        return {key: _data(entry) for key, entry in value.items()}
+    return value.model_dump(mode="json", exclude_unset=True) if isinstance(value, Section) else value
 
 
 def scenario_name(name_or_path: ScenarioLike) -> str:
@@ -248,6 +251,9 @@ def schema_text() -> str:
     used = _reachable(_references(schema["properties"]), definitions)
     schema["$defs"] = {name: definitions[name] for name in sorted(used)}
     whole = {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+    text = json.dumps(whole).replace(json.dumps(TEXTS)[1:-1], '"$ref": "#/$defs/Quantity"')
+    whole = json.loads(text)
+    whole["$defs"]["Quantity"] = {**TEXTS, "pattern": r"^\s*[+-]?\.?\d"}
     return json.dumps(whole, indent=2) + "\n"
 
 

@@ -85,7 +85,7 @@ class Dynamics(Section):
     """Allow negative speeds."""
     max_acceleration: Annotated[Positive, units.ACCELERATION] = 2.0
     """m/s^2"""
-    max_steering: Annotated[float, Field(gt=0.0, lt=1.5), units.STEERING] = 0.6981317007977318
+    max_steering: Annotated[float, Field(gt=0.0, lt=1.5), units.TURN] = 0.6981317007977318
     """rad, to either side"""
     max_steering_rate: Annotated[Positive, units.TURN_RATE] = 2.0
     """rad/s"""
@@ -122,7 +122,7 @@ class Action(Section):
 
     longitudinal: Literal["speed", "acceleration"] = "speed"
     """`speed`: -1..1 spans the permitted speeds (0 or -max .. max); `acceleration`: times max_acceleration."""
-    steering: Annotated[Positive | None, units.STEERING] = None
+    steering: Annotated[Positive | None, units.TURN] = None
     """Steering angle at action 1, rad (none: max_steering)."""
     pan: Pan | None = None
     """None: cameras do not turn."""

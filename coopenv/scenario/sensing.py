@@ -78,7 +78,7 @@ class Camera(Section):
     """Camera to body: `forward` looks along the body's x axis, `body` has the body's own axes."""
     image_size: tuple[Pixels, Pixels] = (316, 208)
     """Width and height, pixels."""
-    focal_length: Annotated[PositiveVector2, units.FOCAL_LENGTH] = (213.161906, 213.521038)
+    focal_length: Annotated[PositiveVector2, units.PIXELS] = (213.161906, 213.521038)
     """fx and fy, pixels."""
     principal_point: Annotated[Vector2, units.PIXELS] = (154.841998, 114.98398)
     """cx and cy, pixels."""
