@@ -112,9 +112,8 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         space = observation_space(self.engine.layout, observation)
         self.observation_spaces = {agent: space for agent in self.possible_agents}
         self.action_spaces = {agent: action_space(scenario) for agent in self.possible_agents}
-        self.state_space = spaces.Box(
-            -STATE_LIMIT, STATE_LIMIT, shape=world_states(self.engine.view, self.scenario).shape[1:], dtype=np.float32
-        )
+        state = world_states(self.engine.view, self.scenario)[0]
+        self.state_space = spaces.Box(-STATE_LIMIT, STATE_LIMIT, shape=state.shape, dtype=np.float32)
         self._step, self._outcomes = Step(self.engine.view, scenario), outcome_words(scenario)
         self._targets = scenario.target_names  # made once, as every step needs both
         self._notes = backend.notes if isinstance(backend, Broadcasting) else None

@@ -100,14 +100,9 @@ def exchange(part: Path, place: Path, old: Path) -> None:
         raise
 
 
-def _hidden(place: Path, suffix: str) -> str:
-    """Return the pattern of the hidden folders beside a place."""
-    return f".{escape(place.name)}.{'[0-9a-f]' * 8}{suffix}"
-
-
 def clean(place: Path, names: Collection[str]) -> None:
     """Remove what killed runs have left beside a place; finish a replacement that one had begun."""
-    for left in place.parent.glob(_hidden(place, ".*")):
+    for left in place.parent.glob(f".{escape(place.name)}.{'[0-9a-f]' * 8}.*"):
         if left.suffix == PART:
             shutil.rmtree(left, ignore_errors=True)
         elif left.suffix == OLD and not os.path.lexists(place):
@@ -238,9 +233,8 @@ def _alone(folder: str | Path, place: Path, part: Path) -> Iterator[None]:
     """Hold the folder `part` of a run. Raises OutputError: another run holds one for the same place."""
     own = lock(part, shared=True)  # as files within do; of two runs at once, at least one then finds the other
     try:
-        for other in place.parent.glob(_hidden(place, PART)) if own is not None else ():
-            if other == part:
-                continue
+        others = place.parent.glob(f".{escape(place.name)}.{'[0-9a-f]' * 8}{PART}") if own is not None else ()
+        for other in (other for other in others if other != part):
             with suppress(FileNotFoundError):  # removed meanwhile
                 if (free := lock(other)) is None:
                     raise OutputError(f"cannot write to {folder}: another run is writing its results there")

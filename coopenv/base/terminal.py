@@ -1,11 +1,15 @@
 """A console for texts as they are and tables that are never cut."""
 
 import re
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import replace
 from io import StringIO
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
-from rich.table import Table
+from rich.measure import Measurement
+from rich.table import Column, Table
 from rich.text import Text
 
 from coopenv.base.errors import printable
@@ -31,13 +35,44 @@ class Terminal(Console):
         return super().render_str(re.sub(r"[^\n\t]+", lambda part: printable(part[0]), text), **options)
 
 
+CONTINUED = ("\n", "from\n", "at\n")
+"""Beginnings of headings that continue the heading of the column before."""
+
+
 class NumberTable(Table):
     """A table that takes the width that it needs: at least that of its longest words, where texts may be wrapped."""
 
+    folds = False
+    """Columns that do not fit into a line stand in further tables with the same first column."""
+
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        width = self.__rich_measure__(console, options.update(max_width=10_000))
+        width = self._measure(console, options)
         needed = width.maximum if all(column.no_wrap for column in self.columns) else width.minimum
+        if self.folds and needed > options.max_width:
+            return self._parts(console, options)
         return super().__rich_console__(console, options.update(max_width=max(options.max_width, needed)))
+
+    def _measure(self, console: Console, options: ConsoleOptions) -> Measurement:
+        return self.__rich_measure__(console, options.update(max_width=10_000))
+
+    def _parts(self, console: Console, options: ConsoleOptions) -> "list[NumberTable]":
+        groups: list[list[Column]] = []
+        for column in self.columns[1:]:
+            groups += [] if str(column.header).startswith(CONTINUED) else [[]]
+            groups[-1].append(column)
+        parts: list[NumberTable] = []
+        for group in groups:
+            wider = self._of([*parts[-1].columns, *group]) if parts else None
+            if wider is None or wider._measure(console, options).maximum > options.max_width:
+                parts.append(self._of([self.columns[0], *group]))
+            else:
+                parts[-1] = wider
+        return parts
+
+    def _of(self, columns: Sequence[Column]) -> "NumberTable":
+        part = copy(self)
+        part.columns, part.folds = [replace(column, _index=i) for i, column in enumerate(columns)], False
+        return part
 
 
 def text_of(shown: Any, width: int) -> str:

@@ -14,33 +14,27 @@ from pydantic_core import core_schema
 from coopenv.base.errors import ScenarioWarning, shown
 from coopenv.base.sections import rewritten
 
-SCALES: Mapping[str, Mapping[str, float]] = {
-    "m": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3},
-    "rad": {"rad": 1.0, "deg": math.pi / 180, "mrad": 1e-3},
-    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600.0},
-    "Hz": {"Hz": 1.0, "kHz": 1e3},
-    "pixels": {"pixels": 1.0, "px": 1.0},
-    "share": {"%": 0.01},
+DEGREE = math.pi / 180.0
+UNITS: Mapping[str, tuple[str, Mapping[str, float]]] = {
+    "m": ("millimetres or centimetres in place of metres?", {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3}),
+    "rad": ("degrees in place of radians?", {"rad": 1.0, "deg": DEGREE, "°": DEGREE, "mrad": 1e-3}),
+    "s": ("milliseconds in place of seconds?", {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600.0}),
+    "m/s": ("km/h or mm/s in place of m/s?", {"m/s": 1.0, "km/h": 1 / 3.6, "cm/s": 1e-2, "mm/s": 1e-3}),
+    "rad/s": ("deg/s in place of rad/s?", {"rad/s": 1.0, "deg/s": DEGREE, "°/s": DEGREE, "mrad/s": 1e-3}),
+    "m/s^2": ("mm/s^2 in place of m/s^2?", {"m/s^2": 1.0, "m/s²": 1.0, "mm/s^2": 1e-3, "mm/s²": 1e-3}),
+    "Hz": ("a period in seconds in place of a rate in Hz?", {"Hz": 1.0, "1/s": 1.0, "kHz": 1e3}),
+    "pixels": ("metres or millimetres in place of pixels?", {"pixels": 1.0, "px": 1.0}),
+    "share": ("per cent in place of a share?", {"%": 0.01}),
 }
-"""Sizes of the units of a text, by the unit of the key. Quotients such as km/h follow from them."""
+"""By the unit of a key: the likely mistake in an implausible number, and sizes of the units of a text."""
 
-LIKELY: Mapping[str, str] = {
-    "m": "millimetres or centimetres in place of metres?",
-    "rad": "degrees in place of radians?",
-    "s": "milliseconds in place of seconds?",
-    "m/s": "km/h or mm/s in place of m/s?",
-    "rad/s": "deg/s in place of rad/s?",
-    "m/s/s": "mm/s^2 in place of m/s^2?",
-    "Hz": "a period in place of a frequency in Hz?",
-    "pixels": "metres or millimetres in place of pixels?",
-    "share": "per cent in place of a share?",
-}
-"""Likely mistake in a number beyond the range, by the unit of the key."""
+_TEXT = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\s\d.].*?)\s*")
 
-_TEXT = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\W\d_%].*?|[%°].*?)\s*")
+TEXTS = {"type": ["number", "string"]}
+"""Types of a number with a unit in a JSON schema."""
 
 
-@dataclass(frozen=True, eq=False)  # two quantities may have the same range
+@dataclass(frozen=True, eq=False)
 class Unit:
     """Unit and plausible range of a quantity; the annotation of a number, `Annotated[Positive, LENGTH]`."""
 
@@ -57,45 +51,28 @@ class Unit:
         Raises:
             ValueError: the text has another kind of unit, or an implausible number is also out of bounds.
         """
-        number = self.converted(given) if isinstance(given, str) else given
+        (likely, sizes), number = UNITS[self.symbol], given
+        if isinstance(given, str) and (found := _TEXT.fullmatch(given)):
+            if found[2] not in sizes:
+                raise ValueError(f"{given!r} has no unit of this key; allowed: {', '.join(sizes)}")
+            number = float(found[1]) * sizes[found[2]]
         try:
             return checked(number)
         except ValidationError as error:
             if type(number) not in (int, float) or not self.doubt(number):
                 raise
-            raise ValueError(f"{error.errors()[0]['msg']}, got {shown(given)}: {LIKELY[self.symbol]}") from None
-
-    def converted(self, text: str) -> float | str:
-        """Return a text with a unit as a number in the key's unit, another text unchanged.
-
-        Raises:
-            ValueError: the text has another kind of unit.
-        """
-        found = _TEXT.fullmatch(text)
-        if found is None:
-            return text
-        parts = [SCALES[part] for part in self.symbol.split("/")]
-        units = found[2].replace("°", "deg").replace("^2", "²").replace("s²", "s/s").split("/")
-        if len(units) != len(parts) or any(unit not in known for unit, known in zip(units, parts, strict=True)):
-            raise ValueError(f"{text!r} has no unit of this key; allowed: {' / '.join(map(', '.join, parts))}")
-        size, *divisors = (known[unit] for unit, known in zip(units, parts, strict=True))
-        return float(found[1]) * size / math.prod(divisors)
+            raise ValueError(f"{error.errors()[0]['msg']}, got {shown(given)}: {likely}") from None
 
     def doubt(self, value: float, factor: float = 1.0) -> str:
-        """Return why a number is implausible and its likely unit, or nothing; `factor` widens the range."""
-        if abs(value) > self.most * factor:
-            limit = f"above {self.most * factor:.4g}"
-        elif 0.0 < abs(value) < self.least:
-            limit = f"below {self.least:.4g}"
-        else:
+        """Return why a number is implausible, and the likely mistake, or nothing; `factor` widens the range."""
+        if value == 0.0 or self.least <= abs(value) <= self.most * factor:
             return ""
-        return f"{value:.6g} {self.symbol} is implausible ({limit}): {LIKELY[self.symbol]}"
+        expected = f"{self.least:g} to {self.most * factor:.5g}"
+        return f"{value:.6g} {self.symbol} is implausible (expected {expected}): {UNITS[self.symbol][0]}"
 
-    def holds_for(self, part: Any) -> bool:
-        """Return whether a number, or a tuple of numbers, is plausible; False where that is not seen at a glance."""
-        if type(part) is tuple and part and type(part[0]) is float:
-            return max(part) <= self.most and -self.most <= min(part) and not self.least
-        return False
+    def holds_for(self, numbers: tuple[Any, ...]) -> bool:
+        """Return whether a tuple consists of plausible numbers."""
+        return {*map(type, numbers)} == {float} and max(map(abs, numbers)) <= self.most and not self.least
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         def reading(node: Any) -> Any:
@@ -105,19 +82,15 @@ class Unit:
         return rewritten(handler(source), reading)
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
-        """Return the JSON schema, in which a text with a unit may stand for a number."""
         return rewritten(handler(schema), lambda node: node | TEXTS if node.get("type") == "number" else node)
 
-
-TEXTS = {"type": ["number", "string"]}
-"""Types of a number that has a unit in a JSON schema."""
 
 PLACE = Unit("m", 1_000.0)  # coordinates; the range grows with the scene
 DISTANCE = Unit("m", 2_000.0)  # ranges of sensors and radio, ways
 EXTENT = Unit("m", 500.0)  # sizes of buildings and roads, offsets of faults
 LENGTH = Unit("m", 30.0)  # sizes on and about a vehicle
 DETAIL = Unit("m", 2.0)  # tags and errors of sensors' positions
-HEADING = Unit("rad", 2.0 * math.pi + 1e-3)
+HEADING = Unit("rad", 3.0 * math.pi)
 TURN = Unit("rad", math.pi + 1e-3)  # turns by which poses differ, steering
 SMALL_ANGLE = Unit("rad", 0.2)  # errors of bearings and of cameras' mounting
 TIME = Unit("s", 1_000.0)  # times in an episode; the range grows with a long episode
@@ -129,7 +102,7 @@ DRIVEN_SPEED = Unit("m/s", 30.0)
 SPEED_ERROR = Unit("m/s", 3.0)
 TURN_RATE = Unit("rad/s", 5.0)
 TURN_RATE_ERROR = Unit("rad/s", 0.4)
-ACCELERATION = Unit("m/s/s", 20.0)
+ACCELERATION = Unit("m/s^2", 20.0)
 FREQUENCY = Unit("Hz", 5_000.0, least=0.2)
 PIXELS = Unit("pixels", 50_000.0, least=20.0)
 SHARE = Unit("share", 0.5)
@@ -143,7 +116,7 @@ def units_of(model: type[BaseModel]) -> dict[str, Unit]:
 
 
 def warn_of_implausible(model: BaseModel, factors: Mapping[Unit, float], where: str = "") -> None:
-    """Warn of every key of a section with implausible numbers; of equal entries of lists, the first is named.
+    """Warn of every key of a section with implausible numbers; of the entries of a list, the first is named.
 
     Args:
         model: the section.
@@ -163,10 +136,12 @@ def _doubts(node: Any, where: str, unit: Unit | None, factors: Mapping[Unit, flo
     if isinstance(node, BaseModel):
         units, given = units_of(type(node)), vars(node)
         parts = [(name, given[name], units.get(name)) for name in node.model_fields_set]
-    elif isinstance(node, dict | tuple):
-        parts = [(name, part, unit) for name, part in (node.items() if isinstance(node, dict) else enumerate(node))]
+    elif isinstance(node, dict):
+        parts = [(name, part, unit) for name, part in node.items()]
+    elif isinstance(node, tuple) and (unit is None or not unit.holds_for(node)):
+        parts = [(i, part, unit) for i, part in enumerate(node)]
     elif unit is not None and isinstance(node, float) and (doubt := unit.doubt(node, factors.get(unit, 1.0))):
         yield where, doubt
     for name, part, own in parts:
-        if not isinstance(part, str) and (own is None or not own.holds_for(part)):
+        if own is not None or not isinstance(part, str):
             yield from _doubts(part, f"{where}.{name}", own, factors)

@@ -331,7 +331,7 @@ def watch(
     scenario = options.load(name, options.parse_overrides(overrides))
     from coopenv.base.files import replacing_folder
     from coopenv.runs import live
-    from coopenv.runs.console import Progress
+    from coopenv.runs.console import Progress, note_overwritten
     from coopenv.runs.films import VIDEO_FILES, video_path, write_pictures
 
     policy = found.policy(scenario)
@@ -340,6 +340,7 @@ def watch(
     else:
         stage = live.LiveWorld(scenario, log)
         with replacing_folder(out, VIDEO_FILES) as folder, Progress(log, f"filming {video_path(folder).name}"):
+            note_overwritten(out, VIDEO_FILES, log)
             fps = scenario.rates.camera / stage.stride
             write_pictures(video_path(folder), fps, stage.pictures(policy, seed))
     for line in stage.outcomes():

@@ -27,17 +27,8 @@ from coopenv.observers.contract import Factory
 from coopenv.observers.registry import states_covariance, with_observer
 from coopenv.policies import Policy
 from coopenv.runs.bundle import RECORD_FILE, RunRecord
-from coopenv.runs.console import (
-    Progress,
-    compile_notice,
-    estimates_tables,
-    gaps,
-    legend,
-    metrics_tables,
-    note_overwritten,
-    rates,
-    remarks,
-)
+from coopenv.runs import console as lines
+from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.films import VIDEO_FILES, top_view_film, video_path, write_film
 from coopenv.runs.rollouts import Rollout, estimates, run_metrics, theory_rates, vehicle_metrics
 from coopenv.runs.scenes import Keeper, frame_stride, source_of, write_page
@@ -90,24 +81,22 @@ def execute(
     paced = scenario.rates.camera if able.real_time and not able.simulated_clock else None
     doing = "replaying" if able.recorded else "driving" if able.real_time else "simulating"
     with nullcontext() if out is None else replacing_folder(out, result_names()) as folder:
-        note_overwritten(out, METRICS_FILE, log)
+        lines.note_overwritten(out, result_names(), log)
         with compile_notice(log):
             run.engine.load()
         keeper = Keeper(run.engine, source_of(run.engine, name, run.seed, run.policy_name))
         record = None if able.recorded or able.real_time or out is None else RunRecord(run)
-        with (
-            Progress(log, doing, run.ticks_planned, paced) as progress,
-            _kept_if_failed(record, out, name, log),
-        ):
-            for tick in run.play():
-                if record is not None:
-                    record.tick(tick)
-                if keeper.tick(tick):
-                    progress.update(tick, describe() if describe is not None else None)
-        if check is not None:
-            check()
-        trajectory = run.trajectory()
-        results, observability = _figures_of(name, overrides, run, trajectory, steady)
+        with Progress(log, doing, run.ticks_planned, paced) as progress:
+            with _kept_if_failed(record, out, name, log):
+                for tick in run.play():
+                    if record is not None:
+                        record.tick(tick)
+                    if keeper.tick(tick):
+                        progress.update(tick, describe() if describe is not None else None)
+            if check is not None:
+                check()
+            trajectory = run.trajectory()
+            results, observability = _figures_of(name, overrides, run, trajectory, steady)
         if folder is None or out is None:
             return results
         scene = keeper.record()
@@ -330,7 +319,7 @@ class Results(Tabular):
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         if others := self.metrics.get("without_truth"):
-            yield from estimates_tables(others, options.max_width)
+            yield lines.estimates_table(others)
             yield f"No true poses, and so no errors. Standard deviations: mean after {self.steady_from:g} s."
         if not self.metrics["vehicles"]:
             return
@@ -338,14 +327,14 @@ class Results(Tabular):
             yield ""
         shown, end = shown_vehicles(self.trajectory, self.steady_from, self.ends), float(self.trajectory.t[-1])
         vehicles = [self.metrics["vehicles"][i] for i in shown]
-        yield from metrics_tables(vehicles, options.max_width)
+        yield lines.metrics_table(vehicles)
         if note := shown_note(len(self.trajectory.vehicles)):
             yield f"{note}; all of them: {METRICS_FILE}"
         yield ""
-        yield from rates(vehicles, options.max_width)
-        yield from gaps(self.metrics, len(self.trajectory.t), end)
-        yield from legend(self.steady_from, end, self.trajectory.nees_dof)
-        yield from remarks(vehicles)
+        yield from lines.rates(vehicles)
+        yield from lines.gaps(self.metrics, len(self.trajectory.t), end)
+        yield from lines.legend(self.steady_from, end, self.trajectory.nees_dof)
+        yield from lines.remarks(vehicles)
 
     @property
     def ends(self) -> list[float]:

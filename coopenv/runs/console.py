@@ -18,7 +18,7 @@ from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeRemainingCol
 from rich.progress import Progress as Bar
 from rich.table import Table
 
-from coopenv.base.errors import shortened
+from coopenv.base.errors import shown
 from coopenv.base.format import column, number, seconds
 from coopenv.base.terminal import NumberTable
 from coopenv.estimation.metrics import CONVERGED, SETTLED
@@ -28,6 +28,7 @@ from coopenv.world.launch import start_warp
 LINE_PERIOD = 10.0  # s between lines of progress where there is no terminal
 ENOUGH = 1.0  # s of work after its first part, from which on its pace can be estimated; at least 2 % are then done
 HINT_FROM = 20.0  # s of work left as soon as its pace is known, from which on there is a line at once
+MOST_SHOWN = 0.99  # share of a bar at most while its results are still computed or written
 COMPILE_NOTICE_AFTER = 1.5  # s between looks for what is being compiled; shorter compilations are not announced
 
 
@@ -85,7 +86,8 @@ class Progress:
             self._burst = min(self._burst, now + 0.25 * (now - self._begin))
             self._first = now, completed
         self._completed, self._description = completed, description or self._description
-        self._bar.update(self._task, completed=completed, total=self._total, description=self._description)
+        drawn = min(completed, MOST_SHOWN * (self._total or inf))
+        self._bar.update(self._task, completed=drawn, total=self._total, description=self._description)
         if not self._hinted and not isnan(left := self._left()):
             self._hinted = True
             if left > HINT_FROM and not self._drawn:
@@ -98,8 +100,8 @@ class Progress:
     def line(self) -> str:
         """Return the progress of the work, e.g. `simulating: 40 % after 20 s, about 30 s left`."""
         elapsed, left, share = monotonic() - self._begin, self._left(), self._share
-        done = f"{100 * share:.0f} % after " if 0.0 < share < 1.0 else "the last part, after " if share else ""
-        rest = "" if isnan(left) else f", about {left:.0f} s left"
+        done = f"{100 * min(share, MOST_SHOWN):.0f} % after " if share else ""
+        rest = ", results follow" if share >= 1.0 else "" if isnan(left) else f", about {left:.0f} s left"
         return f"{self._description}: {done}{elapsed:.0f} s{rest}"
 
     @property
@@ -123,15 +125,15 @@ class Progress:
             self._log.print(self.line(), soft_wrap=True)
 
 
-def note_overwritten(folder: Path | None, name: str, log: Console) -> None:
-    """Print in one line the earlier result in a folder that a run will overwrite; `name` is that of its facts' file."""
-    if folder is not None and (path := folder / name).is_file():
-        facts: Any = {}
-        with suppress(OSError, ValueError):
-            facts = json.loads(path.read_text(encoding="utf-8"))
-        words = facts if isinstance(facts, dict) else {}
-        seed = f"seed {words['seed']} of {words.get('environment')}" if "seed" in words else "an earlier result"
-        log.print(f"overwrites {shortened(str(words.get('command', seed)), 200)} in {folder}", soft_wrap=True)
+def note_overwritten(folder: Path | None, names: Sequence[str], log: Console) -> None:
+    """Print what a run will overwrite in a folder, if anything; `names` are those of its files, its facts first."""
+    found = [folder / name for name in names if (folder / name).is_file()] if folder is not None else []
+    if found:
+        what = "an earlier result"
+        with suppress(OSError, ValueError, TypeError, KeyError):  # not of a run
+            facts = json.loads(found[0].read_bytes())
+            what = f"seed {facts['seed']:d} of {shown(facts['environment'])}"
+        log.print(f"overwrites {what} in {folder}", soft_wrap=True)
 
 
 @contextmanager
@@ -181,18 +183,16 @@ RATE_COLUMNS = {
 }
 """Key of a vehicle's metrics and heading."""
 
-CONTINUED = ("\n", "from\n", "at\n")
-"""Beginnings of headings that continue the column before."""
-
 VERDICTS = {
     "not_observable_s": "not observable",
     "carried_by_odometry_s": f"not observable now, but carried by odometry (within {CONVERGED.text})",
 }
 
 
-def number_table(names: Sequence[str], numbers: Sequence[str], gap: int = 1) -> Table:
-    """Return an empty table: columns of names, then of numbers, `gap` + 1 spaces between them."""
+def number_table(names: Sequence[str], numbers: Sequence[str], gap: int = 1, folds: bool = False) -> Table:
+    """Return an empty table: columns of names, then of numbers, `gap` + 1 spaces between them; see `NumberTable`."""
     table = NumberTable(box=box.HORIZONTALS, padding=(0, gap, 0, 0), pad_edge=False, show_edge=False)
+    table.folds = folds
     for heading in names:
         table.add_column(heading, no_wrap=True)
     for heading in numbers:
@@ -200,58 +200,35 @@ def number_table(names: Sequence[str], numbers: Sequence[str], gap: int = 1) -> 
     return table
 
 
-def row_tables(
-    name: str, rows: Sequence[str], columns: Sequence[tuple[str, Sequence[str]]], width: int
-) -> Iterator[Table]:
-    """Yield one row per vehicle, in as many tables as it takes for the columns to fit into a width.
-
-    A heading of `CONTINUED` stays with the column before it.
-    """
-    groups: list[list[tuple[str, Sequence[str]]]] = []
-    for heading, cells in columns:
-        if not heading.startswith(CONTINUED):
-            groups.append([])
-        groups[-1].append((heading, cells))
-    parts: list[list[tuple[str, Sequence[str]]]] = []
-    names = used = max(len(line) for text in (name, *rows) for line in text.split("\n"))
-    for group in groups:
-        needed = sum(
-            2 + max(len(line) for text in (head, *cells) for line in text.split("\n")) for head, cells in group
-        )
-        if not parts or used + needed > width:
-            parts.append([])
-            used = names
-        parts[-1] += group
-        used += needed
-    for part in parts:
-        table = number_table([name], [heading for heading, _ in part])
-        for row in zip(rows, *(cells for _, cells in part), strict=True):
-            table.add_row(*row)
-        yield table
+def metrics_table(vehicles: list[dict[str, Any]]) -> Table:
+    """Return one row per vehicle: initial error, times to settle and converge, steady errors, targets, NEES."""
+    table = number_table(["\nvehicle"], [heading for _, heading, _ in COLUMNS], folds=True)
+    cells = [write([vehicle[key] for vehicle in vehicles]) for key, _, write in COLUMNS]
+    for vehicle, row in zip(vehicles, zip(*cells, strict=True), strict=True):
+        table.add_row(vehicle["vehicle"], *row)
+    return table
 
 
-def metrics_tables(vehicles: list[dict[str, Any]], width: int) -> Iterator[Table]:
-    """Yield one row per vehicle: initial error, times to settle and converge, steady errors, targets, NEES."""
-    columns = [(heading, write([vehicle[key] for vehicle in vehicles])) for key, heading, write in COLUMNS]
-    yield from row_tables("\nvehicle", [vehicle["vehicle"] for vehicle in vehicles], columns, width)
-
-
-def estimates_tables(vehicles: list[dict[str, Any]], width: int) -> Iterator[Table]:
-    """Yield one row per vehicle without true poses: last estimate, standard deviations, targets."""
+def estimates_table(vehicles: list[dict[str, Any]]) -> Table:
+    """Return one row per vehicle without true poses: last estimate, standard deviations, targets."""
     headings = ("ends at x\n[m]", "y\n[m]", "yaw\n[deg]", "std\n[m]", "\n[deg]", "targets\nseen")
+    table = number_table(["\nvehicle"], headings, folds=True)
     ends = np.array([[*row["final_position_estimate_m"][:2], row["final_yaw_estimate_deg"]] for row in vehicles])
     keys = ("position_std_m", "orientation_std_deg", "mean_targets_in_view")
     cells = [*map(column, ends.T), *(column([row[key] for row in vehicles]) for key in keys)]
-    columns = [*zip(headings, cells, strict=True)]
-    yield from row_tables("\nvehicle", [vehicle["vehicle"] for vehicle in vehicles], columns, width)
+    for vehicle, row in zip(vehicles, zip(*cells, strict=True), strict=True):
+        table.add_row(vehicle["vehicle"], *row)
+    return table
 
 
-def rates(vehicles: list[dict[str, Any]], width: int) -> Iterator[Table | str]:
+def rates(vehicles: list[dict[str, Any]]) -> Iterator[Table | str]:
     """Yield the measured rates beside the theory's, and their meaning; nothing without a theory."""
     if all(math.isnan(vehicle["guaranteed_rate_per_s"]) for vehicle in vehicles):
         return
-    columns = [(text, [number(vehicle[key], 3) for vehicle in vehicles]) for key, text in RATE_COLUMNS.items()]
-    yield from row_tables("rate\nvehicle", [vehicle["vehicle"] for vehicle in vehicles], columns, width)
+    table = number_table(["rate\nvehicle"], [*RATE_COLUMNS.values()], folds=True)
+    for vehicle in vehicles:
+        table.add_row(vehicle["vehicle"], *(number(vehicle[key], 3) for key in RATE_COLUMNS))
+    yield table
     yield "Guaranteed: the least of the run, in the norm of P. Frozen: k lambda_min(P M)."
     yield ""
 

@@ -99,10 +99,10 @@ Scenario.__replace__ = lambda self, **changes: load_scenario(self, changes)
 
 def _data(value: Any) -> Any:
     """Return a copy of an entry, sections and their lists as plain data."""
+    if isinstance(value, dict):
+        return {key: _data(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [_data(entry) for entry in value]
-    if isinstance(value, Mapping):
-        return {key: _data(entry) for key, entry in value.items()}
     return value.model_dump(mode="json", exclude_unset=True) if isinstance(value, Section) else value
 
 
@@ -249,12 +249,11 @@ def schema_text() -> str:
         "description": "Entries of every vehicle without its own.",
     }
     used = _reachable(_references(schema["properties"]), definitions)
-    schema["$defs"] = {name: definitions[name] for name in sorted(used)}
-    whole = {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
-    text = json.dumps(whole).replace(json.dumps(TEXTS)[1:-1], '"$ref": "#/$defs/Quantity"')
-    whole = json.loads(text)
-    whole["$defs"]["Quantity"] = {**TEXTS, "pattern": r"^\s*[+-]?\.?\d"}
-    return json.dumps(whole, indent=2) + "\n"
+    definitions["Quantity"] = {"type": ["string", "number"], "pattern": r"^\s*[+-]?\.?\d"}
+    schema["$defs"] = {name: definitions[name] for name in sorted({*used, "Quantity"})}
+    whole = json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", **schema})
+    shared = whole.replace(json.dumps(TEXTS)[1:-1], '"$ref": "#/$defs/Quantity"')
+    return json.dumps(json.loads(shared), indent=2) + "\n"
 
 
 def _without_lists(node: dict[str, Any]) -> dict[str, Any]:

@@ -257,15 +257,11 @@ class Scenario(Section, metaclass=_Loaded):
                 raise ValueError(f"landmark name '{landmark.name}' is reserved for vehicles")
         return landmarks
 
-    @property
-    def _extent(self) -> float:
-        """Largest plausible coordinate, m: farther with roads, and with many vehicles and routes."""
-        roads = (abs(x) for road in self.roads for x in (*road.start, *road.end))
-        return PLACE.most + max(roads, default=0.0) + 50.0 * (len(self.vehicles) + len(self.routes))
-
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
-        warn_of_implausible(self, {PLACE: self._extent / PLACE.most, TIME: max(1.0, self.horizon / TIME.most)})
+        ends = [abs(x) for x in (*self.map.origin, *(x for road in self.roads for x in (*road.start, *road.end)))]
+        farthest = PLACE.most + max(ends) + 50.0 * (len(self.vehicles) + len(self.routes))
+        warn_of_implausible(self, {PLACE: farthest / PLACE.most, TIME: max(1.0, self.horizon / TIME.most)})
         vehicles, targets = len(self.vehicles), len(self.target_names)
         if vehicles * targets > MOST_PAIRS and self.topology.most_nearby is None:
             pairs = f"{vehicles} times {targets} targets are over {MOST_PAIRS:.0e} pairs"

@@ -19,12 +19,12 @@ from rich.console import Console
 import coopenv
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.installation import data_directory
-from coopenv.base.terminal import Terminal
+from coopenv.base.terminal import Terminal, text_of
 from coopenv.cli.app import main
 from coopenv.estimation import compiled
 from coopenv.runs import console as module
 from coopenv.runs import scenario_text as words
-from coopenv.runs.console import Progress, compile_notice, note_overwritten, row_tables
+from coopenv.runs.console import Progress, compile_notice, note_overwritten, number_table
 from coopenv.runs.scenario_text import IMAGE_FIELDS, settings
 from coopenv.runs.summary import describe_scenario
 from coopenv.scenario import parse_scenario
@@ -411,20 +411,39 @@ def test_what_is_drawn_is_described() -> None:
 
 
 def test_columns_that_do_not_fit_stand_in_a_further_table() -> None:
-    columns = [("start\n[m]", ["0.1"]), ("\n[deg]", ["4"]), ("RMSE\n[m]", ["0.2"])]
-    whole, [first, second] = (
-        [*row_tables("\nvehicle", ["vehicle_1"], columns, 40)],
-        [*row_tables("\nvehicle", ["vehicle_1"], columns, 25)],
-    )
-    assert len(whole) == 1
-    assert [column.header for column in first.columns] == ["\nvehicle", "start\n[m]", "\n[deg]"]
-    assert [column.header for column in second.columns] == ["\nvehicle", "RMSE\n[m]"]
+    table = number_table(["\nvehicle"], ["start\n[m]", "\n[deg]", "RMSE\n[m]"], folds=True)
+    table.add_row("vehicle_1", "0.1", "4", "0.2")
+    headings = ["start", "vehicle [m] [deg]", "vehicle_1 0.1 4", "RMSE", "vehicle [m]", "vehicle_1 0.2"]
+    folded = [" ".join(line.split()) for line in text_of(table, 25).splitlines() if "─" not in line]
+    assert folded == headings
+    assert text_of(table, 40).count("vehicle_1") == 1
+    assert text_of(table, 20).count("vehicle_1") == 2
 
 
-def test_an_overwritten_result_is_printed_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "metrics.json").write_text('{"seed": 3, "environment": "facade"}')
+@pytest.mark.parametrize(
+    ("facts", "words"),
+    [('{"seed": 3, "environment": "facade"}', "seed 3 of 'facade'"), ("[]", "an earlier result"), ("", "an earlier")],
+)
+def test_an_overwritten_result_is_printed_in_one_line(
+    facts: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "metrics.json").write_text(facts)
     log = Terminal(width=200)
-    note_overwritten(tmp_path, "metrics.json", log)
-    note_overwritten(None, "metrics.json", log)
-    note_overwritten(tmp_path, "other.json", log)
-    assert capsys.readouterr().out == f"overwrites seed 3 of facade in {tmp_path}\n"
+    note_overwritten(tmp_path, ["other.json", "metrics.json"], log)
+    note_overwritten(None, ["metrics.json"], log)
+    note_overwritten(tmp_path, ["other.json"], log)
+    [line] = capsys.readouterr().out.splitlines()
+    assert line.startswith(f"overwrites {words}") and line.endswith(f" in {tmp_path}")
+
+
+def test_a_bar_has_no_end_before_its_results_are_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [100.0]
+    monkeypatch.setattr(module, "monotonic", lambda: clock[0])
+    progress = Progress(Console(file=io.StringIO()), "simulating", total=4)
+    progress.__enter__()
+    progress.update(2)
+    clock[0] = 113.0
+    progress.update(4)
+    assert progress.line() == "simulating: 99 % after 13 s, results follow"
+    assert progress._bar.tasks[0].completed < 4
+    progress.__exit__()

@@ -23,7 +23,7 @@ from coopenv.estimation.metrics import CONVERGED
 from coopenv.estimation.observability import Trajectory, analyse_observability
 from coopenv.policies import load_agent
 from coopenv.runs import Rollout, rollout
-from coopenv.runs.console import gaps, legend, metrics_tables, rates, remarks
+from coopenv.runs.console import gaps, legend, metrics_table, rates, remarks
 from coopenv.runs.recorder import drive_vehicles
 from coopenv.runs.rollouts import Ending, outcome_line, run_metrics, theory_rates, vehicle_metrics
 from tests.helpers.commands import printed, refused
@@ -215,7 +215,7 @@ def test_the_table_has_a_row_per_vehicle_and_a_legend() -> None:
     assert math.isnan(vehicles[0]["ended_at_s"])
     assert vehicles[0]["rate_remark"] == "error fell below half within 1 tick, no rate to fit"
     assert list(remarks(vehicles)) == []
-    [table] = metrics_tables(vehicles, 80)
+    table = metrics_table(vehicles)
     assert table.row_count == len(vehicles)
     assert [str(column.header).split()[0] for column in table.columns][3:5] == ["settles", "converges"]
     assert not any("-" in str(column.header) for column in table.columns)

@@ -78,7 +78,7 @@ def perform(
     names += [name for form in FORMATS for name in figure_files(tuple(plan.source.variants), form)]
     try:
         with nullcontext() if out is None else replacing_folder(out, names) as folder:
-            note_overwritten(out, JSON_FILE, log)
+            note_overwritten(out, names, log)
             for name, reason in plan.left_out.items():
                 log.print(f"left out: {name} ({reason})", soft_wrap=True, markup=False)
             with Progress(log, plan.work, total=1.0) as progress:
@@ -89,7 +89,8 @@ def perform(
                     draws = study_basin(plan.source, plan.observers, basin, executor, progress.update)
                 found = replace(found, draws=draws)
             if folder is not None:
-                write_files(found, command, folder, wanted, width)
+                with Progress(log, "writing tables and report"):
+                    write_files(found, command, folder, wanted, width)
                 names = sorted(path.name for path in folder.iterdir())
     finally:  # hours of work are printed even if they cannot be written
         if found is not None and as_json:
