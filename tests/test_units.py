@@ -78,9 +78,9 @@ def test_every_implausible_key_is_named_once_with_value_unit_and_likely_mistake(
         warn_of_implausible(parts, {TIME: 2.0}, "parts")
     lengths, times = UNITS["m"][0], UNITS["s"][0]
     assert sorted(str(line.message) for line in caught) == [
-        f"parts.named.x: 1e+06 s is implausible (expected 0 to 2000): {times}",
-        f"parts.places.0.0: 6000 m is implausible (expected 0 to 1000): {lengths}",
-        f"parts.side: 60 m is implausible (expected 0 to 2): {lengths}",
+        f"parts.named.x: 1e+06 s is implausible (expected magnitude 0 to 2000): {times}",
+        f"parts.places.0.0: 6000 m is implausible (expected magnitude 0 to 1000): {lengths}",
+        f"parts.side: 60 m is implausible (expected magnitude 0 to 2): {lengths}",
     ]
 
 
@@ -92,7 +92,7 @@ def test_the_entries_of_a_list_are_named_once() -> None:
 
 
 def test_numbers_below_the_range_are_implausible_and_zero_is_not() -> None:
-    assert PIXELS.doubt(0.004).startswith("0.004 pixels is implausible (expected 20 to 50000): metres or millimetres")
+    assert PIXELS.doubt(0.004).startswith("0.004 pixels is implausible (expected magnitude 20 to 50000): metres or millimetres")
     assert PIXELS.doubt(0.0) == PIXELS.doubt(213.0) == ""
 
 

@@ -347,7 +347,6 @@ QuaternionWxyz = Annotated[tuple[Number, Number, Number, Number], AfterValidator
 Positive = Annotated[float, Field(gt=0.0, le=LARGEST)]
 NonNegative = Annotated[float, Field(ge=0.0, le=LARGEST)]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
-Loss = Annotated[float, Field(ge=0.0, lt=1.0)]
 Rate = Annotated[float, Field(ge=1e-3, le=1e5)]
 PositiveVector2 = tuple[Positive, Positive]
 PositiveVector3 = tuple[Positive, Positive, Positive]

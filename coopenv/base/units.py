@@ -6,13 +6,13 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import core_schema
 
 from coopenv.base.errors import ScenarioWarning, shown
-from coopenv.base.sections import rewritten
+from coopenv.base.sections import Probability, rewritten
 
 DEGREE = math.pi / 180.0
 UNITS: Mapping[str, tuple[str, Mapping[str, float]]] = {
@@ -24,7 +24,7 @@ UNITS: Mapping[str, tuple[str, Mapping[str, float]]] = {
     "m/s^2": ("mm/s^2 in place of m/s^2?", {"m/s^2": 1.0, "m/s²": 1.0, "mm/s^2": 1e-3, "mm/s²": 1e-3}),
     "Hz": ("a period in seconds in place of a rate in Hz?", {"Hz": 1.0, "1/s": 1.0, "kHz": 1e3}),
     "pixels": ("metres or millimetres in place of pixels?", {"pixels": 1.0, "px": 1.0}),
-    "share": ("per cent in place of a share?", {"%": 0.01}),
+    "as a share": ("per cent in place of a share?", {"%": 0.01}),
 }
 """By the unit of a key: the likely mistake in an implausible number, and sizes of the units of a text."""
 
@@ -68,7 +68,7 @@ class Unit:
         if value == 0.0 or self.least <= abs(value) <= self.most * factor:
             return ""
         expected = f"{self.least:g} to {self.most * factor:.5g}"
-        return f"{value:.6g} {self.symbol} is implausible (expected {expected}): {UNITS[self.symbol][0]}"
+        return f"{value:.6g} {self.symbol} is implausible (expected magnitude {expected}): {UNITS[self.symbol][0]}"
 
     def holds_for(self, numbers: tuple[Any, ...]) -> bool:
         """Return whether a tuple consists of plausible numbers."""
@@ -105,7 +105,10 @@ TURN_RATE_ERROR = Unit("rad/s", 0.4)
 ACCELERATION = Unit("m/s^2", 20.0)
 FREQUENCY = Unit("Hz", 5_000.0, least=0.2)
 PIXELS = Unit("pixels", 50_000.0, least=20.0)
-SHARE = Unit("share", 0.5)
+SHARE = Unit("as a share", 0.5)  # errors of scales
+CHANCE = Unit("as a share", 1.0)
+Chance = Annotated[Probability, CHANCE]
+Loss = Annotated[float, Field(ge=0.0, lt=1.0), CHANCE]
 
 
 @cache
@@ -135,7 +138,7 @@ def _doubts(node: Any, where: str, unit: Unit | None, factors: Mapping[Unit, flo
     parts: Any = ()
     if isinstance(node, BaseModel):
         units, given = units_of(type(node)), vars(node)
-        parts = [(name, given[name], units.get(name)) for name in node.model_fields_set]
+        parts = [(name, given.get(name), units.get(name)) for name in node.model_fields_set]
     elif isinstance(node, dict):
         parts = [(name, part, unit) for name, part in node.items()]
     elif isinstance(node, tuple) and (unit is None or not unit.holds_for(node)):

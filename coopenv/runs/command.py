@@ -26,8 +26,8 @@ from coopenv.estimation.observability import Observability, Trajectory, analyse_
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import states_covariance, with_observer
 from coopenv.policies import Policy
-from coopenv.runs.bundle import RECORD_FILE, RunRecord
 from coopenv.runs import console as lines
+from coopenv.runs.bundle import RECORD_FILE, RunRecord
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.films import VIDEO_FILES, top_view_film, video_path, write_film
 from coopenv.runs.rollouts import Rollout, estimates, run_metrics, theory_rates, vehicle_metrics

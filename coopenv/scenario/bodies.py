@@ -15,7 +15,6 @@ from coopenv.base.sections import (
     Positive,
     PositiveVector2,
     PositiveVector3,
-    Probability,
     QuaternionWxyz,
     Section,
     Vector2,
@@ -225,9 +224,9 @@ class Landmark(Section):
     """Position (of its origin, at t = 0) in the coordinates of this file, m."""
     position_spread: Annotated[NonNegativeVector3, units.EXTENT] = (0.0, 0.0, 0.0)
     """Half-widths of a uniform offset along its own x, y, z axes, drawn at every reset, m; vehicles know it."""
-    presence: Probability = 1.0
+    presence: units.Chance = 1.0
     """Chance that it is there, drawn at every reset; vehicles know."""
-    pace_spread: Probability = 0.0
+    pace_spread: units.Chance = 0.0
     """Half-width of a uniform factor about 1 of the pace of its motion, drawn at every reset."""
     group: str | None = None
     """The group of `landmark_groups` that draws its position; written by the group."""
@@ -256,9 +255,9 @@ class Vehicle(Section):
     body: Body | None = None
     marker: Annotated[Vector3, units.LENGTH] = (0.0, 0.0, 0.0)
     """The point of this vehicle that other cameras see, in its body frame, m."""
-    presence: Probability = 1.0
+    presence: units.Chance = 1.0
     """Chance that it is there, drawn at every reset; one vehicle is always left, a driven one where there is any."""
-    pace_spread: Probability = 0.0
+    pace_spread: units.Chance = 0.0
     """Half-width of a uniform factor about 1 of the pace of a prescribed motion, drawn at every reset."""
     entry: Annotated[tuple[NonNegative, NonNegative] | None, units.TIME] = None
     """First and last time at which it appears at its start, drawn uniformly, s (none: at the reset). It waits until no
@@ -334,7 +333,7 @@ class LandmarkGroup(Section):
     lines: tuple[Line, ...] = Field(default=(), max_length=1000)
     height: Annotated[tuple[Number, Number], units.EXTENT]
     """Lowest and highest z, m."""
-    presence: Probability = 1.0
+    presence: units.Chance = 1.0
     """Chance that a landmark of the group is there, drawn for each."""
 
     @model_validator(mode="after")

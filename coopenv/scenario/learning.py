@@ -8,7 +8,7 @@ from pydantic import AfterValidator, ConfigDict, Field, create_model, model_vali
 
 from coopenv.base import units
 from coopenv.base.errors import listed, suggest
-from coopenv.base.sections import NonNegative, Number, Positive, Probability, Section
+from coopenv.base.sections import NonNegative, Number, Positive, Section
 from coopenv.scenario.terms import (
     GROUPS,
     OBSERVATION_FIELDS,
@@ -42,7 +42,7 @@ class Observation(Section):
     """m/s, of measured velocities"""
     angular_velocity_scale: Annotated[Positive, units.TURN_RATE] = 3.0
     """rad/s, of measured angular velocities"""
-    age_scale: Annotated[Positive, units.TIME] = 1.0
+    age_scale: Annotated[Positive, units.LAG] = 1.0
     """s; older measurements read 1"""
     map_scale: Annotated[Positive, units.DISTANCE] = 10.0
     """m, of landmarks of the map"""
@@ -163,7 +163,7 @@ class Reward(Section):
     """Reward of a driven vehicle: its own weighted sum, or the mean or the least of all driven vehicles. With `mean`
     and `min`, an episode continues, without actions, until it is over for all of them; the mean is over all present
     vehicles, the least over the vehicles under way."""
-    own_share: Probability = 0.0
+    own_share: units.Chance = 0.0
     """Share of a vehicle's own weighted sum in its reward with a team; the rest is the team's."""
     uncertainty_threshold: Annotated[NonNegative, units.LENGTH] = 0.02
     """Threshold, m; terms per metre count the excess"""

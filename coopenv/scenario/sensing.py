@@ -13,13 +13,11 @@ from coopenv.base import units
 from coopenv.base.errors import shown
 from coopenv.base.sections import (
     Direction,
-    Loss,
     NonNegative,
     NonNegativeVector3,
     Number,
     Positive,
     PositiveVector2,
-    Probability,
     QuaternionWxyz,
     Rate,
     Sample,
@@ -90,7 +88,7 @@ class Camera(Section):
     """Round detections to whole pixels."""
     range: Annotated[Positive | None, units.DISTANCE] = None
     """Farthest distance at which a target is detected, m (none: unlimited)."""
-    miss_probability: Probability = 0.0
+    miss_probability: units.Chance = 0.0
     """Chance that a detection in view is lost, drawn per target and frame."""
     extrinsics_error: Annotated[NonNegative, units.SMALL_ANGLE] = 0.0
     """Standard deviation per axis of a rotation by which the true camera is turned against `orientation`, rad; drawn
@@ -125,7 +123,7 @@ class Images(Section):
     """Standard deviation of the blur, pixels."""
     noise: Annotated[float, Field(ge=0.0, le=255.0)] = 2.0
     """Standard deviation of a pixel, shades: black and white are 190 apart."""
-    wrong_identity: Probability = 0.0
+    wrong_identity: units.Chance = 0.0
     """Chance that a tag that is found is taken for that of another target of the vehicle, drawn per tag and frame. Lost
     ones: `camera.miss_probability`."""
 
@@ -174,7 +172,7 @@ class Slip(Section):
     """Slips begin so often, 1/s."""
     duration: Annotated[Positive, units.LAG] = 0.5
     """Mean duration, s; durations are exponentially distributed."""
-    size: NonNegative = 0.3
+    size: Annotated[NonNegative, units.CHANCE] = 0.3
     """Largest share by which the measured speed is too high, drawn uniformly per slip."""
     angle: Annotated[NonNegative, units.TURN] = 0.0
     """Largest angle between the measured and the true direction of travel, drawn uniformly per slip, to either side,
@@ -234,7 +232,7 @@ class V2x(Section):
     """Camera ticks from sending to receiving; 0: a leader's estimate of the same tick."""
     period: int = Field(default=1, ge=1, le=100_000)
     """Camera ticks between messages."""
-    loss: Loss = 0.0
+    loss: units.Loss = 0.0
     """Chance that one receiver loses one message."""
     range: Annotated[Positive | None, units.DISTANCE] = None
     """Farthest distance at which messages are received, m (none: unlimited)."""
@@ -278,7 +276,7 @@ LONGEST_REPLAY = 60.0
 class Restart(Section):
     """A vehicle whose computer starts anew: its observer loses all, and begins again knowing nothing of its pose."""
 
-    chance: Probability = 0.0
+    chance: units.Chance = 0.0
     """Probability that the vehicle restarts in an episode."""
     time: Annotated[NonNegative, units.TIME] = 0.0
     """When, s; it takes place at the next decision, never in the first one."""
@@ -289,7 +287,7 @@ class Restart(Section):
 class Corruption(Section):
     """Messages whose pose is altered on the way, so that they can still be read. What cannot is lost: `v2x.loss`."""
 
-    probability: Probability = 0.0
+    probability: units.Chance = 0.0
     """Probability of each message, for all its receivers."""
     start: Annotated[NonNegative, units.TIME] = 0.0
     """Time of the start, s."""
@@ -305,7 +303,7 @@ class Lie(Section):
     kind: Literal["none", "jump", "drift", "replay", "collude"] = "none"
     """`jump`: a position off by `offset`; `drift`: one that walks away at `speed`; `replay`: its own message of `age`
     before, as if it were new; `collude`: as `jump`, and all that collude are off by the same, drawn once for them."""
-    chance: Probability = 1.0
+    chance: units.Chance = 1.0
     """Probability that the vehicle lies in an episode; drawn once for all colluding vehicles."""
     start: Annotated[NonNegative, units.TIME] = 0.0
     """Time of the start, s."""
@@ -330,7 +328,7 @@ class Lie(Section):
 class MapError(Section):
     """Landmarks whose place on a vehicle's map is wrong; a wrong entry is the same on all maps that have it."""
 
-    chance: Probability = 0.0
+    chance: units.Chance = 0.0
     """Probability that an entry is wrong in an episode, drawn per landmark."""
     landmark: str | None = Field(default=None, max_length=64)
     """Name of the landmark (default: any may be wrong)."""
@@ -349,7 +347,7 @@ class MapError(Section):
 class Jammer(Section):
     """A jammer that the vehicle carries: receivers in its range lose all messages, its own receiver too."""
 
-    chance: Probability = 0.0
+    chance: units.Chance = 0.0
     """Probability that the vehicle has a jammer in an episode."""
     range: Annotated[Positive | None, units.DISTANCE] = None
     """Range, m (none: unlimited)."""

@@ -71,14 +71,41 @@ MISTAKES: dict[str, tuple[Any, str]] = {
     "horizon": (50_000, "milliseconds"),
     "faults.lie.start": (3000, "milliseconds"),
     "routes.0.waypoints": ([[0, 0], [50_000, 0]], "millimetres"),
+    "landmarks.0.yaw": (270, "degrees"),
+    "vehicles.0.initial_estimate.yaw": (45, "degrees"),
+    "vehicles.0.initial_estimate.position_offset": ([800, -600, 0], "millimetres"),
+    "vehicles.0.marker": ([0, 0, 150], "centimetres"),
+    "vehicles.0.entry": ([5000, 10_000], "milliseconds"),
+    "vehicles.0.motion.linear": ([80, 0, 0], "km/h"),
+    "vehicles.0.motion.angular": ([0, 0, 30], "deg/s"),
+    "roads": ([{"start": [0, 0], "end": [50, 0], "width": 3500}], "millimetres"),
+    "routes.0.corner_radius": (6000, "millimetres"),
+    "dynamics.max_acceleration": (2000, "mm/s"),
+    "dynamics.speed_time_constant": (200, "milliseconds"),
+    "action.pan.rate": (90, "deg/s"),
+    "v2x.staleness": (2000, "milliseconds"),
+    "faults.clock_offset": (50, "milliseconds"),
+    "faults.lie.offset": (5000, "millimetres"),
+    "faults.lie.turn": (30, "degrees"),
+    "faults.jammer.period": (1500, "milliseconds"),
+    "noise.bearing.rate": (0.0167, "period"),
+    "noise.slip.size": (30, "per cent"),
+    "noise.gyro_bias_walk": (1.0, "deg/s"),
+    "camera.focal_length_error": (2, "per cent"),
+    "camera.principal_point": ([0.002, 0.0015], "millimetres"),
+    "camera.extrinsics_position_error": (10, "millimetres"),
 }
+WITH = {"vehicles.0.motion.": {"kind": "constant", "linear": [1, 0, 0]}, "action.pan.": {"limit": 1.0, "rate": 1.0}}
+"""Tables that further entries belong to."""
 
 
 @pytest.mark.parametrize("key", MISTAKES)
 def test_a_mistake_of_units_is_named_in_one_line(key: str) -> None:
     value, mistake = MISTAKES[key]
-    [line] = doubts(yard(), {key: value})
-    assert re.match(re.escape(key).replace(r"\*", "0") + r"[.\w]*: [-\d.e+]+ [\w/^]+ is implausible \(expected ", line)
+    tables = {start.rstrip("."): table for start, table in WITH.items() if key.startswith(start)}
+    [line] = doubts(yard(), {**tables, key: value})
+    place = re.escape(key).replace(r"\*", "0")
+    assert re.match(place + r"[.\w]*: [-\d.e+]+ [\w/^ ]+ is implausible \(expected magnitude [-\w.+ ]+\): ", line)
     assert re.search(mistake, line)
 
 
@@ -87,6 +114,10 @@ def test_a_mistake_of_units_is_named_in_one_line(key: str) -> None:
     [
         ("action.pan", {"limit": 90, "rate": 1.0}, r"pan\.limit: .*, got 90: degrees in place of radians\?"),
         ("dynamics.max_steering", 40, r"max_steering: .*, got 40: degrees in place of radians\?"),
+        ("faults.lie", {"kind": "replay", "age": 500}, r"lie\.age: .*, got 500: milliseconds in place of seconds\?"),
+        ("v2x.loss", 10, r"v2x\.loss: .*, got 10: per cent in place of a share\?"),
+        ("landmarks.0.presence", 90, r"presence: .*, got 90: per cent in place of a share\?"),
+        ("camera.range", -20, r"camera\.range: Input should be greater than 0, got -20$"),
     ],
 )
 def test_an_error_of_a_bound_names_the_likely_unit(key: str, value: Any, words: str) -> None:
@@ -105,11 +136,20 @@ def test_texts_with_units_are_accepted_in_files_dicts_and_overrides(tmp_path: Pa
     )
     made = load_scenario(path, {"camera.range": "2000 cm", "rates.camera": "0.06 kHz"})
     assert (made.horizon, made.camera.range, made.rates.camera) == (60.0, 20.0, 60.0)
+    assert load_scenario(yard(), {"v2x.loss": "10 %"}).v2x.loss == pytest.approx(0.1)
     assert made.noise.bearing.scale == pytest.approx(0.0523598776)
     assert made.vehicles[0].initial_pose is not None
     assert made.vehicles[0].initial_pose.position == pytest.approx((-5.0, 0.0, 0.02))
     assert made.landmarks[0].position == (1000.0, 2.0, 3.0)
     assert (made | {"dynamics.max_speed": "3.6 km/h"}).dynamics.max_speed == pytest.approx(1.0)
+
+
+def test_coordinates_far_from_the_file_s_origin_are_plausible_about_the_map_s() -> None:
+    east, north = 674_000.0, 6_580_000.0
+    marks = [{**mark, "position": [mark["position"][0] + east, mark["position"][1] + north, 1.0]} for mark in MARKS]
+    car = {"motion": {"kind": "driven"}, "initial_pose": {"position": [east, north, 0.0]}}
+    world = {"title": "t", "horizon": 5400.0, "map": {"origin": [east, north, 0.0]}, "landmarks": marks}
+    assert doubts({**world, "vehicles": [car]}) == []
 
 
 SOURCES = [
