@@ -24,6 +24,7 @@ from coopenv.observers.registry import list_observers
 from coopenv.runs import console
 from coopenv.runs.command import Results
 from coopenv.runs.recorder import record
+from tests.helpers.commands import refused
 from tests.helpers.env_suite import ALIKE, each_slow
 
 FILES = {"metrics.json", "trajectory.npz", "scene.npz", "record.zip"}
@@ -333,6 +334,17 @@ def test_scenarios_from_a_path_and_their_warnings(capsys: pytest.CaptureFixture[
 )
 def test_values_are_toml_or_else_strings(text: str, value: object) -> None:
     assert parse_value(text) == value
+
+
+@pytest.mark.parametrize("option", ["--set", "--override"])
+def test_overrides_have_units_and_their_mistakes_are_named(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    units = [option, 'noise.bearing.scale="3 deg"', option, "noise.velocity=20 cm/s"]
+    assert main(["describe", "facade", *units, option, "dynamics.max_speed=54"]) == 0
+    out, err = capsys.readouterr()
+    assert "0.05236 rad" in out and "noise 0.2 m/s" in out
+    line = "dynamics.max_speed: 54 m/s is implausible (expected magnitude 0 to 30): km/h or mm/s in place of m/s?"
+    assert line in " ".join(err.split())
+    assert refused("describe", "facade", option, "camera.range=5 kg").endswith("allowed: m, mm, cm, km\n")
 
 
 def test_a_module_that_is_not_installed_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:

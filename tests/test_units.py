@@ -92,7 +92,9 @@ def test_the_entries_of_a_list_are_named_once() -> None:
 
 
 def test_numbers_below_the_range_are_implausible_and_zero_is_not() -> None:
-    assert PIXELS.doubt(0.004).startswith("0.004 pixels is implausible (expected magnitude 20 to 50000): metres or millimetres")
+    assert PIXELS.doubt(0.004).startswith(
+        "0.004 pixels is implausible (expected magnitude 20 to 50000): metres or millimetres"
+    )
     assert PIXELS.doubt(0.0) == PIXELS.doubt(213.0) == ""
 
 

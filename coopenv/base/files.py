@@ -231,7 +231,7 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
 @contextmanager
 def _alone(folder: str | Path, place: Path, part: Path) -> Iterator[None]:
     """Hold the folder `part` of a run. Raises OutputError: another run holds one for the same place."""
-    own = lock(part, shared=True)  # as files within do; of two runs at once, at least one then finds the other
+    own = lock(part, inf, shared=True)  # as files within do; of two runs at once, at least one then finds the other
     try:
         others = place.parent.glob(f".{escape(place.name)}.{'[0-9a-f]' * 8}{PART}") if own is not None else ()
         for other in (other for other in others if other != part):
