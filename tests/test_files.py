@@ -226,7 +226,7 @@ def test_links_stay_links_and_modes_stay_modes(place: Path) -> None:
 def test_a_second_run_into_a_folder_is_refused_and_the_first_one_is_whole(place: Path) -> None:
     with replacing_folder("result", NAMES) as first:
         (first / "a.txt").write_text("1" * 20_000)
-        with pytest.raises(OutputError, match="^cannot write to result: another run is writing its results there$"):
+        with pytest.raises(OutputError, match=r"^cannot write to result: another run is writing its results there$"):
             write("result", 4)
         write("beside", 5)
         assert first.is_dir() and generation_of(place / "result") == 0

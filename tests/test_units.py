@@ -30,6 +30,7 @@ class Parts(Section):
     side: Annotated[Positive | None, DETAIL] = None
     places: Annotated[tuple[Vector2, ...], PLACE] = ()
     named: Annotated[dict[str, Positive], TIME] = Field(default={})
+    times: Annotated[tuple[Positive, ...], TIME] = ()
     plain: float = 0.0
 
 
@@ -73,14 +74,14 @@ def test_bounds_hold_for_the_converted_number() -> None:
 
 
 def test_every_implausible_key_is_named_once_with_value_unit_and_likely_mistake() -> None:
-    parts = validated(Parts, {"side": 60, "places": [[6000, 1], [1, 9000]], "named": {"x": 1e6}, "plain": 1e8}, "parts")
+    parts = validated(Parts, {"side": 60, "places": [[6000, 1], [1, 9000]], "times": [1e6], "plain": 1e8}, "parts")
     with pytest.warns(ScenarioWarning) as caught:
         warn_of_implausible(parts, {TIME: 2.0}, "parts")
     lengths, times = UNITS["m"][0], UNITS["s"][0]
     assert sorted(str(line.message) for line in caught) == [
-        f"parts.named.x: 1e+06 s is implausible (expected magnitude 0 to 2000): {times}",
         f"parts.places.0.0: 6000 m is implausible (expected magnitude 0 to 1000): {lengths}",
         f"parts.side: 60 m is implausible (expected magnitude 0 to 2): {lengths}",
+        f"parts.times.0: 1e+06 s is implausible (expected magnitude 0 to 2000): {times}",
     ]
 
 

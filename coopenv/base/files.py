@@ -24,6 +24,7 @@ except ImportError:  # no POSIX: whether a hidden folder is in use cannot be tes
     fcntl = None  # type: ignore[assignment]
 
 PART, OLD = ".part", ".old"  # suffixes of hidden folders: for new results, and for replaced results
+_HIDDEN = ".{}." + "[0-9a-f]" * 8
 POLL = 0.02  # s between attempts to lock
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 
@@ -102,7 +103,7 @@ def exchange(part: Path, place: Path, old: Path) -> None:
 
 def clean(place: Path, names: Collection[str]) -> None:
     """Remove what killed runs have left beside a place; finish a replacement that one had begun."""
-    for left in place.parent.glob(f".{escape(place.name)}.{'[0-9a-f]' * 8}.*"):
+    for left in place.parent.glob(_HIDDEN.format(escape(place.name)) + ".*"):
         if left.suffix == PART:
             shutil.rmtree(left, ignore_errors=True)
         elif left.suffix == OLD and not os.path.lexists(place):
@@ -206,7 +207,7 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
         OutputError: it cannot be written or replaced, or another run is writing there, which is found before anything
             is yielded where it can be known; the old folder is untouched.
     """
-    with _staging(folder, partial(_check_folder, names), names) as (place, part), _alone(folder, place, part):
+    with _staging(folder, partial(_check_folder, names), names) as (place, part):
         try:
             yield part
         except OutputError as error:
@@ -226,23 +227,6 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
                 raise OutputError(f"cannot replace {folder}: {why}") from None
             _written(folder, place)
         sync(place.parent)
-
-
-@contextmanager
-def _alone(folder: str | Path, place: Path, part: Path) -> Iterator[None]:
-    """Hold the folder `part` of a run. Raises OutputError: another run holds one for the same place."""
-    own = lock(part, inf, shared=True)  # as files within do; of two runs at once, at least one then finds the other
-    try:
-        others = place.parent.glob(f".{escape(place.name)}.{'[0-9a-f]' * 8}{PART}") if own is not None else ()
-        for other in (other for other in others if other != part):
-            with suppress(FileNotFoundError):  # removed meanwhile
-                if (free := lock(other)) is None:
-                    raise OutputError(f"cannot write to {folder}: another run is writing its results there")
-                os.close(free)
-        yield
-    finally:
-        if own is not None:
-            os.close(own)
 
 
 @contextmanager
@@ -347,6 +331,7 @@ def _staging(
         note(f"kept: {path} of an earlier run" if os.path.lexists(place) else NOTHING)
     part = place.with_name(f".{place.name}.{secrets.token_hex(4)}{PART}")
     _under_way.append(part)
+    own = None
     try:
         with writing(path):
             part.mkdir()
@@ -354,9 +339,17 @@ def _staging(
             probe.write_bytes(bytes(PROBE_BYTES))
             sync(probe)
             probe.unlink()
+        own = lock(part, inf, shared=True) if names else None  # of two runs at once, at least one then finds the other
+        others = place.parent.glob(_HIDDEN.format(escape(place.name)) + PART) if own is not None else ()
+        for other in (other for other in others if other != part):
+            with suppress(FileNotFoundError):  # removed meanwhile
+                if (free := lock(other)) is None:
+                    raise OutputError(f"cannot write to {path}: another run is writing its results there")
+                os.close(free)
         yield place, part
     finally:
         shutil.rmtree(part, ignore_errors=True)
         _under_way.remove(part)
-        if in_use is not None:
-            os.close(in_use)
+        for descriptor in (in_use, own):
+            if descriptor is not None:
+                os.close(descriptor)

@@ -68,7 +68,7 @@ class Section(BaseModel):
     @classmethod
     @cache
     def meanings(cls) -> dict[str, str]:
-        """Return the meaning of every field that has one, by name."""
+        """Return the meaning, or at least the unit, of every field that has one, by name."""
         found: dict[str, str] = {}
         for model in reversed([kind for kind in cls.__mro__ if issubclass(kind, Section) and kind is not Section]):
             with suppress(OSError, TypeError):  # a class that a program has made has no source
@@ -77,7 +77,9 @@ class Section(BaseModel):
                     match field, text:
                         case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(words))):
                             found[name] = inspect.cleandoc(words)
-        return found | {name: info.description for name, info in cls.model_fields.items() if info.description}
+        fields = cls.model_fields.items()
+        units = {name: part.symbol for name, info in fields for part in info.metadata if hasattr(part, "symbol")}
+        return units | found | {name: info.description for name, info in fields if info.description}
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> Any:

@@ -8,7 +8,6 @@ from io import StringIO
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
-from rich.measure import Measurement
 from rich.table import Column, Table
 from rich.text import Text
 
@@ -35,43 +34,29 @@ class Terminal(Console):
         return super().render_str(re.sub(r"[^\n\t]+", lambda part: printable(part[0]), text), **options)
 
 
-CONTINUED = ("\n", "from\n", "at\n")
-"""Beginnings of headings that continue the heading of the column before."""
+CONTINUED = ("\n", "from\n", "at\n")  # beginnings of headings that continue the heading of the column before
 
 
 class NumberTable(Table):
     """A table that takes the width that it needs: at least that of its longest words, where texts may be wrapped."""
 
-    folds = False
-    """Columns that do not fit into a line stand in further tables with the same first column."""
+    folds = False  # True: columns that do not fit into a line stand in a further table with the same first column
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        width = self._measure(console, options)
+        wide = options.update(max_width=10_000)
+        width = self.__rich_measure__(console, wide)
         needed = width.maximum if all(column.no_wrap for column in self.columns) else width.minimum
-        if self.folds and needed > options.max_width:
-            return self._parts(console, options)
+        starts = [i for i in range(2, len(self.columns)) if not str(self.columns[i].header).startswith(CONTINUED)]
+        if self.folds and needed > options.max_width and starts:
+            parts = [self._of(self.columns[:start]) for start in starts]
+            fitting = [part for part in parts if part.__rich_measure__(console, wide).maximum <= options.max_width]
+            first = [*parts[:1], *fitting][-1]
+            return [first, self._of([self.columns[0], *self.columns[len(first.columns) :]])]
         return super().__rich_console__(console, options.update(max_width=max(options.max_width, needed)))
-
-    def _measure(self, console: Console, options: ConsoleOptions) -> Measurement:
-        return self.__rich_measure__(console, options.update(max_width=10_000))
-
-    def _parts(self, console: Console, options: ConsoleOptions) -> "list[NumberTable]":
-        groups: list[list[Column]] = []
-        for column in self.columns[1:]:
-            groups += [] if str(column.header).startswith(CONTINUED) else [[]]
-            groups[-1].append(column)
-        parts: list[NumberTable] = []
-        for group in groups:
-            wider = self._of([*parts[-1].columns, *group]) if parts else None
-            if wider is None or wider._measure(console, options).maximum > options.max_width:
-                parts.append(self._of([self.columns[0], *group]))
-            else:
-                parts[-1] = wider
-        return parts
 
     def _of(self, columns: Sequence[Column]) -> "NumberTable":
         part = copy(self)
-        part.columns, part.folds = [replace(column, _index=i) for i, column in enumerate(columns)], False
+        part.columns = [replace(column, _index=i) for i, column in enumerate(columns)]
         return part
 
 

@@ -5,7 +5,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Annotated, Any
 
 from pydantic import BaseModel, Field, ValidationError
@@ -30,27 +30,19 @@ UNITS: Mapping[str, tuple[str, Mapping[str, float]]] = {
 
 _TEXT = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\s\d.].*?)\s*")
 
-TEXTS = {"type": ["number", "string"]}
-"""Types of a number with a unit in a JSON schema."""
+TEXTS = {"type": ["number", "string"]}  # of a number that has a unit, in a JSON schema
 
 
 @dataclass(frozen=True, eq=False)
 class Unit:
     """Unit and plausible range of a quantity; the annotation of a number, `Annotated[Positive, LENGTH]`."""
 
-    symbol: str
-    """Unit of the key."""
-    most: float
-    """Largest plausible magnitude."""
-    least: float = 0.0
-    """Smallest plausible magnitude other than 0."""
+    symbol: str  # of `UNITS`
+    most: float  # plausible magnitude
+    least: float = 0.0  # plausible magnitude other than 0
 
     def read(self, given: Any, checked: Callable[[Any], Any]) -> Any:
-        """Return a number in the key's unit, `checked`; a text with a unit is converted before.
-
-        Raises:
-            ValueError: the text has another kind of unit, or an implausible number is also out of bounds.
-        """
+        """Return a number or a text with a unit, `checked`. Raises ValueError: its unit or its number is refused."""
         (likely, sizes), number = UNITS[self.symbol], given
         if isinstance(given, str) and (found := _TEXT.fullmatch(given)):
             if found[2] not in sizes:
@@ -75,11 +67,8 @@ class Unit:
         return {*map(type, numbers)} == {float} and max(map(abs, numbers)) <= self.most and not self.least
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        def reading(node: Any) -> Any:
-            is_number = node.get("type") == "float"
-            return core_schema.no_info_wrap_validator_function(self.read, node) if is_number else node
-
-        return rewritten(handler(source), reading)
+        reading = partial(core_schema.no_info_wrap_validator_function, self.read)
+        return rewritten(handler(source), lambda node: reading(node) if node.get("type") == "float" else node)
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
         return rewritten(handler(schema), lambda node: node | TEXTS if node.get("type") == "number" else node)
@@ -121,10 +110,7 @@ def units_of(model: type[BaseModel]) -> dict[str, Unit]:
 def warn_of_implausible(model: BaseModel, factors: Mapping[Unit, float], where: str = "") -> None:
     """Warn of every key of a section with implausible numbers; of the entries of a list, the first is named.
 
-    Args:
-        model: the section.
-        factors: by which the ranges of some units are wider.
-        where: the section's own key.
+    The ranges of some units are wider by `factors`; `where` is the section's own key.
     """
     found: dict[str, str] = {}
     for place, doubt in _doubts(model, where, None, factors):
@@ -139,8 +125,6 @@ def _doubts(node: Any, where: str, unit: Unit | None, factors: Mapping[Unit, flo
     if isinstance(node, BaseModel):
         units, given = units_of(type(node)), vars(node)
         parts = [(name, given.get(name), units.get(name)) for name in node.model_fields_set]
-    elif isinstance(node, dict):
-        parts = [(name, part, unit) for name, part in node.items()]
     elif isinstance(node, tuple) and (unit is None or not unit.holds_for(node)):
         parts = [(i, part, unit) for i, part in enumerate(node)]
     elif unit is not None and isinstance(node, float) and (doubt := unit.doubt(node, factors.get(unit, 1.0))):

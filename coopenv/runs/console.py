@@ -18,7 +18,6 @@ from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeRemainingCol
 from rich.progress import Progress as Bar
 from rich.table import Table
 
-from coopenv.base.errors import shown
 from coopenv.base.format import column, number, seconds
 from coopenv.base.terminal import NumberTable
 from coopenv.estimation.metrics import CONVERGED, SETTLED
@@ -131,8 +130,7 @@ def note_overwritten(folder: Path | None, names: Sequence[str], log: Console) ->
     if found:
         what = "an earlier result"
         with suppress(OSError, ValueError, TypeError, KeyError):  # not of a run
-            facts = json.loads(found[0].read_bytes())
-            what = f"seed {facts['seed']:d} of {shown(facts['environment'])}"
+            what = f"seed {json.loads(found[0].read_bytes())['seed']:d}"
         log.print(f"overwrites {what} in {folder}", soft_wrap=True)
 
 

@@ -77,7 +77,6 @@ class TwistSegment(Section):
     """Constant body twist for a duration."""
 
     duration: Annotated[Positive, units.TIME]
-    """s"""
     linear: Annotated[Vector3, units.SPEED] = (0.0, 0.0, 0.0)
     """Linear velocity in the body frame, m/s."""
     angular: Annotated[Vector3, units.TURN_RATE] = (0.0, 0.0, 0.0)
@@ -98,7 +97,6 @@ class Waypoint(Section):
     """A place to be at a time."""
 
     time: Annotated[NonNegative, units.TIME]
-    """s"""
     position: Annotated[Vector3, units.PLACE]
     """Position in the coordinates of this file, m."""
 
@@ -132,7 +130,6 @@ class DrivenMotion(Section):
     driver: Annotated[str, Field(min_length=1, max_length=1_000)] | None = None
     """Agent that drives it in place of actions: name, folder or `file.py:Class` (none: actions)."""
     initial_speed: Annotated[Number, units.DRIVEN_SPEED] = 0.0
-    """m/s"""
     initial_speed_spread: Annotated[NonNegative, units.DRIVEN_SPEED] = 0.0
     """Half-width of a uniform deviation of it, m/s; the result is clipped to the limits of `[dynamics]`."""
 

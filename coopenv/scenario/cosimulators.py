@@ -72,13 +72,11 @@ class Sumo(Cosimulator):
     posts: bool = True
     """Place a landmark beside the stop line of every road into a junction: at the right, left where traffic is."""
     post_height: Annotated[Positive, units.EXTENT] = 3.0
-    """m"""
     landmarks: Word = "landmark"
     """Points of interest whose type begins so are landmarks, at their parameter `height` or `post_height`."""
     buildings: Word = "building"
     """Polygons whose type begins so are obstacles, up to their parameter `height` or `building_height`."""
     building_height: Annotated[Positive, units.EXTENT] = 10.0
-    """m"""
     options: dict[str, JsonValue] = Field(default={})
     """SUMO's own options by name, without options that follow from settings of this file."""
     included: bool = False

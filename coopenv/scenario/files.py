@@ -6,7 +6,6 @@ import tomllib
 import warnings
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -142,7 +141,7 @@ def repeat_vehicles(raw: dict[str, Any], where: str) -> None:
             expected = f"expected a whole number 1 to {MOST_VEHICLES}, got {shown(count)}"
             raise ScenarioError(f"{where}: vehicles.{i}.{COUNT_KEY}: {expected}")
         _check_size(vehicle, count, f"{where}: vehicles.{i}.{COUNT_KEY}")
-        repeated += [vehicle, *(deepcopy(vehicle) for _ in range(count - 1))]
+        repeated += [vehicle, *(_data(vehicle) for _ in range(count - 1))]
     if repeated:
         raw["vehicles"] = repeated
 

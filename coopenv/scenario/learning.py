@@ -84,11 +84,9 @@ class Dynamics(Section):
     reverse: bool = False
     """Allow negative speeds."""
     max_acceleration: Annotated[Positive, units.ACCELERATION] = 2.0
-    """m/s^2"""
     max_steering: Annotated[float, Field(gt=0.0, lt=1.5), units.TURN] = 0.6981317007977318
     """rad, to either side"""
     max_steering_rate: Annotated[Positive, units.TURN_RATE] = 2.0
-    """rad/s"""
     speed_time_constant: Annotated[NonNegative, units.LAG] = 0.1
     """First-order lag of the drive, s."""
     steering_time_constant: Annotated[NonNegative, units.LAG] = 0.05

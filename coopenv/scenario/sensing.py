@@ -175,8 +175,7 @@ class Slip(Section):
     size: Annotated[NonNegative, units.CHANCE] = 0.3
     """Largest share by which the measured speed is too high, drawn uniformly per slip."""
     angle: Annotated[NonNegative, units.TURN] = 0.0
-    """Largest angle between the measured and the true direction of travel, drawn uniformly per slip, to either side,
-    rad."""
+    """Largest angle (rad) between the measured and the true direction of travel, uniform per slip, to either side."""
 
 
 class Noise(Section):

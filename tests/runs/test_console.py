@@ -422,7 +422,7 @@ def test_columns_that_do_not_fit_stand_in_a_further_table() -> None:
 
 @pytest.mark.parametrize(
     ("facts", "words"),
-    [('{"seed": 3, "environment": "facade"}', "seed 3 of 'facade'"), ("[]", "an earlier result"), ("", "an earlier")],
+    [('{"seed": 3, "environment": "facade"}', "seed 3"), ("[]", "an earlier result"), ("", "an earlier")],
 )
 def test_an_overwritten_result_is_printed_in_one_line(
     facts: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
