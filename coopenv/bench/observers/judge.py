@@ -57,8 +57,8 @@ def windows_of(edges: Iterable[float], steady_from: float, end: float) -> tuple[
     return (*between, TimeWindow(steady_from, end, steady=True))
 
 
-BOUNDS = ("joint", "ancestors", "alone")
-"""Bounds of a vehicle's position: joint over all vehicles, over it and its ancestors, and with known neighbours."""
+BOUNDS = ("joint", "ancestors", "neighbours known")
+"""Bounds of a vehicle's position: joint over all vehicles, over it and its ancestors, and with given poses of neighbours."""
 
 
 @dataclass(frozen=True)
@@ -291,6 +291,30 @@ def horizontal_error(recording: Recording, result: Run) -> Array:
     return np.asarray(np.linalg.norm(offset, axis=-1))
 
 
+START = 1.0  # s; the largest error is judged after it, because the first estimates are drawn
+
+
+def largest_after_start(t: Array, error: Array) -> Array:
+    """Return (N,) the largest of errors (K, N) after `START`; NaN where no error is known."""
+    after = error[t > START]
+    return np.where(np.isfinite(after).any(axis=0), np.nan_to_num(after, nan=-np.inf).max(axis=0, initial=-np.inf), np.nan)
+
+
+def lag(recording: Recording, result: Run, when: NDArray[np.bool_]) -> Array:
+    """Return (N,) s, by which an estimate is late: its error regressed on the true velocity over ticks (K,).
+
+    NaN for a vehicle that does not move.
+    """
+    velocity = np.gradient(recording.truth.position, recording.dt, axis=0)
+    behind = recording.truth.position - result.position
+    moved = result.mean((velocity**2).sum(axis=-1), when)
+    along = result.mean((velocity * behind).sum(axis=-1), when)
+    return np.asarray(along / np.where(moved > STANDS**2, moved, np.nan))
+
+
+STANDS = 0.05  # m/s, slower than any drive
+
+
 def level_measures(error: Array, result: Run) -> dict[str, Array]:
     """Return the figures of the protection levels (N,), over the whole run; NaN where none is stated.
 
@@ -324,7 +348,9 @@ def _measures(scene: RecordProperties, recording: Recording, result: Run) -> dic
         "anees": np.array([result.anees_in(ticks) for ticks in windows]).T,
         "nis": np.where(dof > 0, result.nis, 0.0).sum(axis=0),
         "nis_dof": dof.sum(axis=0).astype(float),
-        "diverged": diverged(*map(_last, errors)),
+        "worst": largest_after_start(result.t, errors[0]),
+        "lag": lag(recording, result, windows[-1]),
+        "diverged": diverged(*errors),
         **level_measures(horizontal_error(recording, result), result),
     }
     single = [_vehicle_measures(recording, result, i) for i in range(len(recording.setups))]
@@ -346,10 +372,3 @@ def _vehicle_measures(recording: Recording, result: Run, i: int) -> dict[str, fl
     ate = absolute_error(truth.position[:, i], result.position[:, i])
     found = {"settle_time": settled, "converge_time": converged, "rate": rate, "ate": ate}
     return found | {"rpe": relative.position, "rpe_orientation": relative.orientation}
-
-
-def _last(error: Array) -> Array:
-    """Return (N,) the last error that is known."""
-    known = np.isfinite(error)
-    last = len(error) - 1 - np.argmax(known[::-1], axis=0)
-    return np.asarray(error[last, np.arange(error.shape[1])])

@@ -21,6 +21,7 @@ from coopenv.bench.observers.rows import (
     WindowRow,
     spread,
     standard_error,
+    verdict_on,
 )
 from coopenv.bench.observers.sources import Robots
 from coopenv.estimation.metrics import SETTLED, mean_or_nan
@@ -53,6 +54,9 @@ def quality(board: Leaderboard, variant: str, observer: str) -> dict[str, Any]:
         "time": measured(each("us_per_update").mean(axis=1)),
         "nis": measured(each("nis").sum(axis=1) / np.where(dof > 0, dof, np.nan)),
         "stated": sorted((row for row in rows if np.isfinite(row.anees)), key=lambda row: row.anees),
+        "verdict": verdict_on(rows),
+        "worst": largest(rows, "worst_after_start_m"),
+        "lag": largest(rows, "lag_s"),
         **{f"worst_{column}": spread(rows, column) for column in ("ratio_to_bound_ancestors", "anees")},
     }
 
@@ -66,7 +70,7 @@ def headline(board: Leaderboard) -> list[str]:
     best = quality(board, first, names[0])
     lines = [
         f"Best of {len(board.observers)} in {board.title} ({first}): {names[0]}, "
-        f"mean position RMSE {_words(board.totals[first, names[0]].rmse)} m in the steady state"
+        f"mean position RMSE {_words(board.totals[first, names[0]].rmse)} m in the steady state, {best['verdict']}"
     ]
     if (ratio := best["worst_ratio_to_bound_ancestors"]).vehicle:
         lines[0] += f", {_words(Measured(*ratio[1:3]))} times the Cramér-Rao bound at worst ({ratio.vehicle})"
@@ -121,6 +125,8 @@ def everything(board: Leaderboard, width: int = WIDTH) -> Iterator[Table | str]:
             yield ratio_table(board, variant)
         yield ""
         yield quality_table(board, variant)
+        yield ""
+        yield consistency_table(board, variant)
         if line := honest_line(board.rows):
             yield line
         if (levels := level_table(board, variant)).row_count:
@@ -208,21 +214,42 @@ def honest_line(rows: Sequence[Row]) -> str:
 
 
 def quality_table(board: Leaderboard, variant: str) -> Table:
-    """Return, of one variant over all vehicles: shares that settle, consistency (1: consistent) and costs."""
-    headings = ["settled", "converged", "diverged", "ANEES\nbest", "ANEES\nworst", "NIS", "sent\nB/s", "us"]
+    """Return, of one variant over all vehicles: shares that settle, the largest error and lag of a vehicle, costs."""
+    headings = ["settled", "converged", "diverged", "worst after\nstart [m]", "lag\n[s]", "sent\nB/s", "us"]
 
     def cells(own: list[Row]) -> list[str]:
-        stated = sorted((row for row in own if np.isfinite(row.anees)), key=lambda row: row.anees)
-        nis = [row.nis for row in own if np.isfinite(row.nis)]
         shares = ("settled_fraction", "converged_fraction", "diverged_fraction")
         return [
             *(f"{100 * mean_of(own, column):.0f}%" for column in shares),
-            *([number(stated[0].anees, 2), compact(stated[-1].anees, stated[-1].anees_se)] if stated else ["-", "-"]),
-            number(float(np.mean(nis)), 2) if nis else "-",
+            *(number(largest(own, column), 2) for column in ("worst_after_start_m", "lag_s")),
             *(f"{mean_of(own, column):.0f}" for column in ("bytes_per_s", "us_per_update")),
         ]
 
     return _add_observers(number_table(["observer"], headings, gap=0), board, variant, cells)
+
+
+def largest(rows: Sequence[Row], column: str) -> float:
+    """Return the value of a column that is farthest from 0; NaN where no vehicle has one."""
+    return max((getattr(row, column) for row in rows if np.isfinite(getattr(row, column))), key=abs, default=np.nan)
+
+
+def consistency_table(board: Leaderboard, variant: str) -> Table:
+    """Return, of one variant over all vehicles: the verdict on their covariances, ANEES and NIS (1: consistent)."""
+    headings = ["verdict", "ANEES\nlowest", "\nhighest", "\nof", "NIS"]
+
+    def cells(own: list[Row]) -> list[str]:
+        stated = sorted((row for row in own if np.isfinite(row.anees)), key=lambda row: row.anees)
+        nis = [row.nis for row in own if np.isfinite(row.nis)]
+        highest = [compact(stated[-1].anees, stated[-1].anees_se), _short(stated[-1].vehicle)] if stated else ["-", "-"]
+        lowest = number(stated[0].anees, 2) if stated else "-"
+        return [verdict_on(own), lowest, *highest, number(float(np.mean(nis)), 2) if nis else "-"]
+
+    return _add_observers(number_table(["consistency"], headings, gap=0), board, variant, cells)
+
+
+def _short(vehicle: str) -> str:
+    """Return the name of a vehicle, the paper's where it has one."""
+    return vehicle.replace("vehicle_", "f")
 
 
 LEVELS = {
@@ -305,7 +332,7 @@ def summary(board: Leaderboard, variant: str) -> Table:
 def _spread(rows: Sequence[WindowRow], column: str, digits: int) -> list[str]:
     """Return the median vehicle's figure, the worst one's, and which vehicle that is."""
     found = spread(rows, column)
-    return [number(found.median, digits), compact(found.worst, found.error), found.vehicle.replace("vehicle_", "f")]
+    return [number(found.median, digits), compact(found.worst, found.error), _short(found.vehicle)]
 
 
 def variant_table(board: Leaderboard, heading: str, column: str, variants: Sequence[str]) -> Table:
