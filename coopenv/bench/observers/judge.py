@@ -297,7 +297,9 @@ START = 1.0  # s; the largest error is judged after it, because the first estima
 def largest_after_start(t: Array, error: Array) -> Array:
     """Return (N,) the largest of errors (K, N) after `START`; NaN where no error is known."""
     after = error[t > START]
-    return np.where(np.isfinite(after).any(axis=0), np.nan_to_num(after, nan=-np.inf).max(axis=0, initial=-np.inf), np.nan)
+    return np.where(
+        np.isfinite(after).any(axis=0), np.nan_to_num(after, nan=-np.inf).max(axis=0, initial=-np.inf), np.nan
+    )
 
 
 def lag(recording: Recording, result: Run, when: NDArray[np.bool_]) -> Array:

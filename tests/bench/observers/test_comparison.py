@@ -23,6 +23,7 @@ from coopenv.bench.observers import compare, find_source
 from coopenv.bench.observers.command import report_text
 from coopenv.bench.observers.comparison import Plan
 from coopenv.bench.observers.faults import VARIANTS
+from coopenv.bench.observers.figures import _document, page_file
 from coopenv.bench.observers.judge import sample_of, scene_of
 from coopenv.bench.observers.rows import Leaderboard, Row
 from coopenv.bench.observers.sources import variants_of
@@ -201,6 +202,19 @@ def test_figures_say_what_they_show(comparison: coopenv.Comparison, kind: str, w
     assert "riccati" in words and ("Raises" in words) == (kind == "variants")
     if kind == "variants":
         assert {"better", "worse"} <= {figure.axes[1].get_xlabel(), figure.axes[1].get_title()}
+
+
+def test_a_narrow_figure_states_how_many_vehicles_it_shows() -> None:
+    found = compare("dead_reckoning", "busy_intersection", 1, overrides={"horizon": 0.5})
+    assert "4 of 5 vehicles" in found.figure("errors", width=7.0).get_supxlabel()
+    assert "vehicles" not in found.figure("errors", width=10.0).get_supxlabel()
+
+
+def test_the_report_opens_with_the_worst_vehicle() -> None:
+    found = compare("dead_reckoning", "busy_intersection_tracking", 1, overrides={"horizon": 1.2})
+    worst = max(range(5), key=lambda i: found.rows[i].worst_after_start_m)
+    assert _document(found)["first"] == worst != 0
+    assert ".value = data.first" in page_file("charts.js").decode()
 
 
 def test_mistakes(comparison: coopenv.Comparison, tmp_path: Path) -> None:
