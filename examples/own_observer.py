@@ -9,7 +9,6 @@ from coopenv import load_scenario, parallel_env
 from coopenv.observers import Estimate, Message, Setup, Tick, register, run
 from coopenv.runs.recorder import record
 
-
 GATE = 13.8  # 0.999 quantile of a chi-square with two degrees of freedom
 
 

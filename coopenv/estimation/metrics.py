@@ -290,8 +290,9 @@ def wilson_interval(successes: int, trials: int) -> Interval:
 
 
 def diverged(position_error: Array, orientation_error: Array) -> np.ndarray:
-    """Return whether runs with these errors (K, ...), m and deg, diverge: an error is above its limit to the end, or
-    exceeds it after both were below. Ticks that are NaN do not count; a run of which nothing is known diverges.
+    """Return whether runs with these errors (K, ...), m and deg, are never below both limits, or exceed one again.
+
+    Ticks that are NaN do not count; a run of which nothing is known diverges.
     """
     below = (position_error <= DIVERGED_POSITION) & (orientation_error <= DIVERGED_ORIENTATION)
     exceeds = (position_error > DIVERGED_POSITION) | (orientation_error > DIVERGED_ORIENTATION)

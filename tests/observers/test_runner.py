@@ -391,7 +391,7 @@ def filters_of_the_documents() -> dict[str, Any]:
 
 @pytest.mark.parametrize("seed", [0, 5])
 def test_filters_of_the_documents_have_no_excursion_at_the_start(seed: int) -> None:
-    made = record(load_scenario("busy_intersection_tracking", {"horizon": 1.5}), seed)
+    made = record(load_scenario("busy_intersection_tracking", {"horizon": 0.5}), seed)
     for name, factory in filters_of_the_documents().items():
         result = run(factory, made)
         assert not result.failure and result.position_error.max() < 3.0, name

@@ -58,7 +58,7 @@ def windows_of(edges: Iterable[float], steady_from: float, end: float) -> tuple[
 
 
 BOUNDS = ("joint", "ancestors", "neighbours known")
-"""Bounds of a vehicle's position: joint over all vehicles, over it and its ancestors, and with given poses of neighbours."""
+"""Bounds of a position: joint over all vehicles, over the vehicle and its ancestors, with given neighbours' poses."""
 
 
 @dataclass(frozen=True)

@@ -297,7 +297,7 @@ NO_COVARIANCE, CONSISTENT, OVERCONFIDENT, UNDERCONFIDENT = VERDICTS = (
 
 
 def verdict_of(anees: float, consistent: Interval) -> str:
-    """Return the verdict on a covariance from its ANEES and the interval of a consistent filter; NaN: none is stated."""
+    """Return the verdict on a covariance by its ANEES and the interval of a consistent filter; NaN: none is stated."""
     if math.isnan(anees):
         return NO_COVARIANCE
     return OVERCONFIDENT if anees > consistent.high else UNDERCONFIDENT if anees < consistent.low else CONSISTENT
