@@ -302,21 +302,6 @@ def largest_after_start(t: Array, error: Array) -> Array:
     )
 
 
-def lag(recording: Recording, result: Run, when: NDArray[np.bool_]) -> Array:
-    """Return (N,) s, by which an estimate is late: its error regressed on the true velocity over ticks (K,).
-
-    NaN for a vehicle that does not move.
-    """
-    velocity = np.gradient(recording.truth.position, recording.dt, axis=0)
-    behind = recording.truth.position - result.position
-    moved = result.mean((velocity**2).sum(axis=-1), when)
-    along = result.mean((velocity * behind).sum(axis=-1), when)
-    return np.asarray(along / np.where(moved > STANDS**2, moved, np.nan))
-
-
-STANDS = 0.05  # m/s, slower than any drive
-
-
 def level_measures(error: Array, result: Run) -> dict[str, Array]:
     """Return the figures of the protection levels (N,), over the whole run; NaN where none is stated.
 
@@ -351,7 +336,6 @@ def _measures(scene: RecordProperties, recording: Recording, result: Run) -> dic
         "nis": np.where(dof > 0, result.nis, 0.0).sum(axis=0),
         "nis_dof": dof.sum(axis=0).astype(float),
         "worst": largest_after_start(result.t, errors[0]),
-        "lag": lag(recording, result, windows[-1]),
         "diverged": diverged(*errors),
         **level_measures(horizontal_error(recording, result), result),
     }

@@ -133,7 +133,6 @@ class Row:
         "or exceed one of them again, and of those that failed"
     )
     worst_after_start_m: float = _column(f"largest position error of all seeds after the first {START:g} s, m")
-    lag_s: float = _column("lateness of the estimate in the steady state: position error regressed on the velocity, s")
     verdict: str = _column("consistent, overconfident or underconfident by anees_low and anees_high; or no covariance")
     ate_m: float = _column("absolute trajectory error over the whole run (evo's APE, nothing aligned), m")
     rpe_m: float = _column(f"relative trajectory error (evo's RPE) over {RELATIVE_DELTA:g} s, m")
@@ -231,7 +230,6 @@ def row_of(
         convergence_rate_per_s=median_of(seeds("rate")),
         diverged_fraction=float(np.mean(seeds("diverged"))),
         worst_after_start_m=float(np.max(seeds("worst"))),
-        lag_s=float(np.mean(seeds("lag"))),
         verdict="" if any(sample.failure for sample in own) else verdict_of(float(np.mean(anees)), honest),
         ate_m=root("ate"),
         rpe_m=root("rpe"),

@@ -55,8 +55,7 @@ def quality(board: Leaderboard, variant: str, observer: str) -> dict[str, Any]:
         "nis": measured(each("nis").sum(axis=1) / np.where(dof > 0, dof, np.nan)),
         "stated": sorted((row for row in rows if np.isfinite(row.anees)), key=lambda row: row.anees),
         "verdict": verdict_on(rows),
-        "worst": largest(rows, "worst_after_start_m"),
-        "lag": largest(rows, "lag_s"),
+        "worst": largest_error(rows),
         **{f"worst_{column}": spread(rows, column) for column in ("ratio_to_bound_ancestors", "anees")},
     }
 
@@ -214,23 +213,23 @@ def honest_line(rows: Sequence[Row]) -> str:
 
 
 def quality_table(board: Leaderboard, variant: str) -> Table:
-    """Return, of one variant over all vehicles: shares that settle, the largest error and lag of a vehicle, costs."""
-    headings = ["settled", "converged", "diverged", "worst after\nstart [m]", "lag\n[s]", "sent\nB/s", "us"]
+    """Return, of one variant over all vehicles: shares that settle, the largest error of a vehicle, costs."""
+    headings = ["settled", "converged", "diverged", "worst after\nstart [m]", "sent\nB/s", "us"]
 
     def cells(own: list[Row]) -> list[str]:
         shares = ("settled_fraction", "converged_fraction", "diverged_fraction")
         return [
             *(f"{100 * mean_of(own, column):.0f}%" for column in shares),
-            *(number(largest(own, column), 2) for column in ("worst_after_start_m", "lag_s")),
+            number(largest_error(own), 2),
             *(f"{mean_of(own, column):.0f}" for column in ("bytes_per_s", "us_per_update")),
         ]
 
     return _add_observers(number_table(["observer"], headings, gap=0), board, variant, cells)
 
 
-def largest(rows: Sequence[Row], column: str) -> float:
-    """Return the value of a column that is farthest from 0; NaN where no vehicle has one."""
-    return max((getattr(row, column) for row in rows if np.isfinite(getattr(row, column))), key=abs, default=np.nan)
+def largest_error(rows: Sequence[Row]) -> float:
+    """Return the largest error after the start of all vehicles, m; NaN where no vehicle has one."""
+    return max((row.worst_after_start_m for row in rows if np.isfinite(row.worst_after_start_m)), default=np.nan)
 
 
 def consistency_table(board: Leaderboard, variant: str) -> Table:

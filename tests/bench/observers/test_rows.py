@@ -108,14 +108,6 @@ def test_the_verdict_on_an_observer_is_the_worst_of_its_vehicles(found: coopenv.
     assert verdict_of(np.nan, Interval(0.8, 1.2)) == "no covariance"
 
 
-def test_a_late_estimate_has_its_lag() -> None:
-    made = record(coopenv.load_scenario("busy_intersection", {"horizon": 2.0}), 0)
-    late = 6
-    position = np.concatenate([np.repeat(made.truth.position[:1], late, axis=0), made.truth.position[:-late]])
-    result = replace(run("dead_reckoning", made), position=position)
-    assert_allclose(judge.lag(made, result, made.t > 1.0), late * made.dt, rtol=0.1)
-
-
 def test_fewer_degrees_of_freedom_than_seeds_have_no_bounds(found: coopenv.Comparison) -> None:
     """The consistency of a few innovations in many seeds."""
     runs = found.groups["nominal", "mekf_covariance"]
