@@ -199,7 +199,7 @@ def test_what_is_no_estimate_is_one_error_line(change: Any, said: str) -> None:
             return change(super().update(tick))
 
     failure = run(Odd, recording()).failure
-    assert "of vehicle_1 at 0.017 s" in failure and said in failure and "\n" not in failure
+    assert "at vehicle_1 at 0.017 s" in failure and said in failure and "\n" not in failure
 
 
 def test_a_sent_message_does_not_change_any_more() -> None:
@@ -235,7 +235,7 @@ def test_what_is_no_message_is_one_error_line(odd: Any, said: str) -> None:
 
 def test_an_observer_that_cannot_be_built_ends_its_run() -> None:
     failure = run("planar_robust", recording()).failure
-    assert failure.startswith("of vehicle_1 at 0.000 s: CoopenvError: PlanarRobust is for robots on a plane")
+    assert failure.startswith("at vehicle_1 at 0.000 s: CoopenvError: PlanarRobust is for robots on a plane")
 
 
 SENSED = ("rotation", "translation", "velocity", "angular_velocity", "targets", "bearings", "valid", "landmarks")

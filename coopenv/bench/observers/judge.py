@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.bench.executors import Executor, Local, Pool
+from coopenv.bench.observers.findings import findings_on
 from coopenv.bench.observers.sources import RecordSource
 from coopenv.estimation.metrics import (
     CONVERGED,
@@ -113,6 +114,8 @@ class JudgedRun:
     series: Series
     stanford: Array
     """(B, B) vehicle ticks by horizontal error and protection level, both in bins of `LEVEL_BINS`; level known."""
+    findings: tuple[str, ...] = ()
+    """Mistakes of the observer, see `findings_on`; empty where it was not examined."""
 
     def measured(self, name: str) -> Array:
         """Return the figures of the vehicles; NaN where the observer failed, which counts as diverged."""
@@ -221,6 +224,8 @@ class Task:
     steady_from: float | None
     edges: tuple[float, ...] = ()
     """Edges of the windows that are judged one by one, s."""
+    examined: bool = False
+    """Whether mistakes of the observers are sought, too."""
 
     @property
     def world(self) -> tuple[RecordSource, str]:
@@ -237,7 +242,10 @@ class Task:
                 dof = len(PLANAR_STATES) if recording.on_a_plane else 6
                 yield failed_run(self.variant, name, scene, dof, ended[name], {})
             else:
-                yield sample_of(self.variant, name, scene, recording, run(factory, recording))
+                result = run(factory, recording)
+                sample = sample_of(self.variant, name, scene, recording, result)
+                found = findings_on(factory, recording, result, scene.steady_from) if self.examined else ()
+                yield replace(sample, findings=found)
 
 
 def judge(task: Task) -> list[JudgedRun]:

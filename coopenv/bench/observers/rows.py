@@ -134,6 +134,7 @@ class Row:
     )
     worst_after_start_m: float = _column(f"largest position error of all seeds after the first {START:g} s, m")
     verdict: str = _column("consistent, overconfident or underconfident by anees_low and anees_high; or no covariance")
+    finding: str = _column("mistakes of the observer in the first seed of the first variant, such as a wrong frame")
     ate_m: float = _column("absolute trajectory error over the whole run (evo's APE, nothing aligned), m")
     rpe_m: float = _column(f"relative trajectory error (evo's RPE) over {RELATIVE_DELTA:g} s, m")
     rpe_deg: float = _column(f"its angle over {RELATIVE_DELTA:g} s, deg")
@@ -231,6 +232,7 @@ def row_of(
         diverged_fraction=float(np.mean(seeds("diverged"))),
         worst_after_start_m=float(np.max(seeds("worst"))),
         verdict="" if any(sample.failure for sample in own) else verdict_of(float(np.mean(anees)), honest),
+        finding=", ".join(own[0].findings),
         ate_m=root("ate"),
         rpe_m=root("rpe"),
         rpe_deg=root("rpe_orientation"),

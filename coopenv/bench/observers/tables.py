@@ -55,6 +55,7 @@ def quality(board: Leaderboard, variant: str, observer: str) -> dict[str, Any]:
         "nis": measured(each("nis").sum(axis=1) / np.where(dof > 0, dof, np.nan)),
         "stated": sorted((row for row in rows if np.isfinite(row.anees)), key=lambda row: row.anees),
         "verdict": verdict_on(rows),
+        "finding": rows[0].finding or "-",
         "worst": largest_error(rows),
         **{f"worst_{column}": spread(rows, column) for column in ("ratio_to_bound_ancestors", "anees")},
     }
@@ -234,14 +235,15 @@ def largest_error(rows: Sequence[Row]) -> float:
 
 def consistency_table(board: Leaderboard, variant: str) -> Table:
     """Return, of one variant over all vehicles: the verdict on their covariances, ANEES and NIS (1: consistent)."""
-    headings = ["verdict", "ANEES\nlowest", "\nhighest", "\nof", "NIS"]
+    headings = ["verdict", "ANEES\nlowest", "\nhighest", "\nof", "NIS", "finding"]
 
     def cells(own: list[Row]) -> list[str]:
         stated = sorted((row for row in own if np.isfinite(row.anees)), key=lambda row: row.anees)
         nis = [row.nis for row in own if np.isfinite(row.nis)]
         highest = [compact(stated[-1].anees, stated[-1].anees_se), _short(stated[-1].vehicle)] if stated else ["-", "-"]
         lowest = number(stated[0].anees, 2) if stated else "-"
-        return [verdict_on(own), lowest, *highest, number(float(np.mean(nis)), 2) if nis else "-"]
+        finding = own[0].finding.replace(", ", "\n") or "-"
+        return [verdict_on(own).replace(" ", "\n"), lowest, *highest, number(float(np.mean(nis)), 2) if nis else "-", finding]
 
     return _add_observers(number_table(["consistency"], headings, gap=0), board, variant, cells)
 
@@ -355,12 +357,13 @@ def failures(rows: Sequence[Row]) -> list[str]:
 
 
 def latex(board: Leaderboard, variant: str) -> str:
-    """Return position RMSE per vehicle in m with standard errors as a LaTeX table.
+    """Return position RMSE per vehicle in m with standard errors, largest errors and verdicts as a LaTeX table.
 
     Five vehicles fit a column of 3.5 in.
     """
     texts = environment(trim_blocks=True, keep_trailing_newline=True)
     texts.filters["cell"] = lambda r: FAILED if r.failure else compact(r.position_rmse_m, r.position_rmse_se_m)
+    texts.filters["judged"] = _judged
     texts.globals["stacked"] = _latex_name
     bounds = {BOUNDS[c]: [number(v, 3) for v in values] for c, values in board.bounds_in(variant).items()}
     values = {"board": board, "variant": variant, "headings": _headings(board), "bounds": bounds}
@@ -371,6 +374,12 @@ def environment(**options: Any) -> Environment:
     """Return the renderer of the templates beside the report's."""
     loader = PackageLoader("coopenv.bench.observers", "page")
     return Environment(loader=loader, undefined=StrictUndefined, **options)
+
+
+def _judged(rows: Sequence[Row]) -> str:
+    """Return the largest error after the start and the verdict of an observer, in words."""
+    failed = any(row.failure for row in rows)
+    return FAILED if failed else f"{number(largest_error(rows), 2)} m, {verdict_on(rows)}"
 
 
 def _latex_name(name: str) -> str:

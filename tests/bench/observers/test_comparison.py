@@ -18,16 +18,16 @@ from scipy.stats import chi2
 
 import coopenv
 from coopenv.base.errors import CoopenvError
-from coopenv.base.format import in_parentheses, with_error
+from coopenv.base.format import in_parentheses, number, with_error
 from coopenv.bench.observers import compare, find_source
 from coopenv.bench.observers.command import report_text
 from coopenv.bench.observers.comparison import Plan
 from coopenv.bench.observers.faults import VARIANTS
 from coopenv.bench.observers.figures import _document, page_file
 from coopenv.bench.observers.judge import sample_of, scene_of
-from coopenv.bench.observers.rows import Leaderboard, Row
+from coopenv.bench.observers.rows import Leaderboard, Row, verdict_on
 from coopenv.bench.observers.sources import variants_of
-from coopenv.bench.observers.tables import everything, failures
+from coopenv.bench.observers.tables import everything, failures, largest_error
 from coopenv.cli.bench import ObserverOptions
 from coopenv.observers import registry, run
 from coopenv.observers.pose_filters import DeadReckoning
@@ -140,9 +140,11 @@ def test_csv_and_latex(comparison: coopenv.Comparison, tmp_path: Path) -> None:
     assert (tmp_path / "rows.tex").read_text() == text
     row = comparison.rows_in("nominal", "riccati")[0]
     assert in_parentheses(row.position_rmse_m, row.position_rmse_se_m) in text
-    assert r" & f1 & f2 \\" in text and text.count(r"\\") == 1 + 3 + 3
+    assert r" & f1 & f2 \\" in text and text.count(r"\\") == 1 + 3 + 3 + 1 + 3
     body = [line for line in text.splitlines() if "&" in line]
-    assert [line.count("&") for line in body] == [2] * len(body)
+    assert [line.count("&") for line in body] == [2] * 7 + [1] * 4
+    riccati = comparison.rows_in("nominal", "riccati")
+    assert f"riccati & \\multicolumn{{2}}{{l}}{{{number(largest_error(riccati), 2)} m, {verdict_on(riccati)}}}" in text
     assert r"Raises & failed & failed \\" in text
 
 
