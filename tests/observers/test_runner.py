@@ -165,7 +165,7 @@ def test_failures_end_in_a_word_not_in_a_crash() -> None:
             return super().update(tick)
 
     result = run(Breaks, recording())
-    assert re.fullmatch(r"of vehicle_3 at 0\.100 s: ZeroDivisionError: no gain \(test_runner\.py:\d+\)", result.failure)
+    assert re.fullmatch(r"at vehicle_3 at 0\.100 s: ZeroDivisionError: no gain \(test_runner\.py:\d+\)", result.failure)
     assert np.isfinite(result.position_error[6, :2]).all()
     assert np.isnan(result.position_error[6:, 2:]).all() and np.isnan(result.position_error[7:]).all()
 

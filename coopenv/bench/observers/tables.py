@@ -243,7 +243,8 @@ def consistency_table(board: Leaderboard, variant: str) -> Table:
         highest = [compact(stated[-1].anees, stated[-1].anees_se), _short(stated[-1].vehicle)] if stated else ["-", "-"]
         lowest = number(stated[0].anees, 2) if stated else "-"
         finding = own[0].finding.replace(", ", "\n") or "-"
-        return [verdict_on(own).replace(" ", "\n"), lowest, *highest, number(float(np.mean(nis)), 2) if nis else "-", finding]
+        innovations = number(float(np.mean(nis)), 2) if nis else "-"
+        return [verdict_on(own).replace(" ", "\n"), lowest, *highest, innovations, finding]
 
     return _add_observers(number_table(["consistency"], headings, gap=0), board, variant, cells)
 
