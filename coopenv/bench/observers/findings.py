@@ -32,8 +32,10 @@ def findings_on(observer: str | Factory, recording: Recording, result: Run, stea
     record = _start(recording)
     errors = ("position_error", "orientation_error", "nees")
     turned = run(observer, _turned(record))
-    sums = [[np.nansum(getattr(one, name)[: record.ticks], axis=0) for name in errors] for one in (result, turned)]
-    found = [] if turned.failure or np.allclose(*sums, rtol=EQUAL, atol=1e-6) else ["wrong frame"]
+    before, after = (
+        [np.nansum(getattr(one, name)[: record.ticks], axis=0) for name in errors] for one in (result, turned)
+    )
+    found = [] if turned.failure or np.allclose(before, after, rtol=EQUAL, atol=1e-6) else ["wrong frame"]
     tick = int(np.flatnonzero(record.due & (record.t <= CHANGE))[-1])
     bearings, inbox = record.bearings.copy(), record.inbox_tick.copy()
     bearings[tick], inbox[tick:] = bearings[tick] @ QUARTER.T, inbox[tick]
