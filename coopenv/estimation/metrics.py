@@ -257,7 +257,7 @@ def mean_or_nan(values: np.ndarray) -> np.ndarray:
 
 
 LEVEL = 0.95
-DIVERGED_POSITION, DIVERGED_ORIENTATION = 5.0, 30.0  # m and deg: a run that ends above either has diverged
+DIVERGED_POSITION, DIVERGED_ORIENTATION = 5.0, 30.0  # m and deg
 
 
 class Interval(NamedTuple):
@@ -290,8 +290,13 @@ def wilson_interval(successes: int, trials: int) -> Interval:
 
 
 def diverged(position_error: Array, orientation_error: Array) -> np.ndarray:
-    """Return whether runs that end with these errors (m, deg) have diverged; NaN, of a failed one, has."""
-    return ~((position_error <= DIVERGED_POSITION) & (orientation_error <= DIVERGED_ORIENTATION))
+    """Return whether runs with these errors (K, ...), m and deg, are never below both limits, or exceed one again.
+
+    Ticks that are NaN do not count; a run of which nothing is known diverges.
+    """
+    below = (position_error <= DIVERGED_POSITION) & (orientation_error <= DIVERGED_ORIENTATION)
+    exceeds = (position_error > DIVERGED_POSITION) | (orientation_error > DIVERGED_ORIENTATION)
+    return np.asarray((exceeds & np.logical_or.accumulate(below, axis=0)).any(axis=0) | ~below.any(axis=0))
 
 
 def position_std(covariance: Array, coordinates: Coordinates, rotation: Array, position: Array) -> Array:

@@ -170,7 +170,7 @@ class ObserverGroup:
         """Return an error that names the vehicle, the time and the reason; KeyboardInterrupt itself is raised."""
         if isinstance(error, KeyboardInterrupt):
             raise error
-        whose = "" if vehicle is None else f"of {self.observer_init.setups[vehicle].name} "
+        whose = "" if vehicle is None else f"at {self.observer_init.setups[vehicle].name} "
         last = extract_tb(error.__traceback__)[-1]
         where = "" if isinstance(error, CoopenvError) else f" ({Path(last.filename).name}:{last.lineno})"
         return ObserverError(f"{whose}at {k * self.observer_init.dt:.3f} s: {error_text(error)}{where}")

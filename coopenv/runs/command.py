@@ -212,7 +212,7 @@ def run(
 def report(run: Rollout, result: "Results", folder: Path, out: Console) -> None:
     """Print the results of `execute` for people."""
     able, metrics = run.engine.backend.capabilities, result.metrics
-    source = f"seed {run.seed}, noise {'on' if run.scenario.noise.enabled else 'off'}"
+    source = f"seed {run.seed}, {noise_note(run.scenario)}"
     done = f"Simulated at {metrics['real_time_factor']:.3g} times real time"
     if able.recorded:
         source, done = "recorded", done.replace("Simulated", "Replayed")
@@ -234,6 +234,17 @@ def report(run: Rollout, result: "Results", folder: Path, out: Console) -> None:
     out.print(fill(names, out.width, initial_indent="  ", subsequent_indent="  "))
     if (page := folder / REPLAY_FILE) in result.files:
         out.print(f"To watch it in a browser, open {page}", soft_wrap=True)
+
+
+def noise_note(scenario: Scenario) -> str:
+    """Return whether noise is on, and which sensors have none."""
+    noise = scenario.noise
+    if not noise.enabled:
+        return "noise off"
+    odometry = noise.velocity or noise.angular_velocity or noise.lasts
+    sensors = {"bearings": noise.bearing.scale, "odometry": odometry}
+    exact = " and ".join(name for name, size in sensors.items() if not size)
+    return f"no noise is set for {exact}" if exact else "noise on"
 
 
 _NEEDED = ("environment", "seed", "policy", "overrides", "versions", "steady_from_s", "vehicles")

@@ -185,7 +185,7 @@ def test_official_test_and_observations_of_plugins() -> None:
 def test_a_failing_observer_is_named_and_a_reset_helps(name: str, why: str) -> None:
     env = short(name)
     env.reset(seed=0)
-    with pytest.raises(CoopenvError, match=f"observer '{name}' of vehicle_1 at 0.100 s: {why}") as caught:
+    with pytest.raises(CoopenvError, match=f"observer '{name}' at vehicle_1 at 0.100 s: {why}") as caught:
         env.step(still(env))
     assert caught.value.__cause__ is not None
     with pytest.raises(CoopenvError, match="reset starts anew"):

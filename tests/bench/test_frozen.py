@@ -138,10 +138,10 @@ def test_an_observer_that_fails_alike_in_many_scenes_has_one_line() -> None:
     benchmark = Frozen("v1")
     scenes = list(benchmark.zoo["scenes"])
     late = [row(name, None, bound_m=None, failure="with seed 1000: more than 120 s (--seconds)") for name in scenes[1:]]
-    other = row(scenes[0], None, bound_m=None, failure="of vehicle_2 at 3.000 s: KeyError: 3 (mine.py:9)")
+    other = row(scenes[0], None, bound_m=None, failure="at vehicle_2 at 3.000 s: KeyError: 3 (mine.py:9)")
     result = {"rows": [other, *late], "scenes": benchmark.zoo["scenes"], "remarks": []}
     lines = [part for part in frozen.report(benchmark, result) if isinstance(part, str) and "failed " in part]
     assert lines == [
-        f"mine ({scenes[0]}): failed of vehicle_2 at 3.000 s: KeyError: 3 (mine.py:9)",
+        f"mine ({scenes[0]}): failed at vehicle_2 at 3.000 s: KeyError: 3 (mine.py:9)",
         f"mine ({', '.join(scenes[1:4])}, ... (29 in all)): failed with seed 1000: more than 120 s (--seconds)",
     ]

@@ -80,7 +80,7 @@ REASONS = {
     "Waits": "with seed 0: more than 2 s on one record (--seconds); its remaining records were not run",
     "Allocates": "with seed 0: more than 400 MiB of memory (--memory)",
     "Delegates": "with seed 0: more than 400 MiB of memory (--memory)",
-    "Raises": "of vehicle_1 at 0.083 s: ValueError: on purpose (mine.py:",
+    "Raises": "at vehicle_1 at 0.083 s: ValueError: on purpose (mine.py:",
     "Interrupts": "with seed 0: KeyboardInterrupt",
     "Ends": "with seed 0: its process ended with status 3",
     "Crashes": "with seed 0: its process ended with SIGSEGV",

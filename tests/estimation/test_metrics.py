@@ -268,9 +268,12 @@ def test_interval_of_a_share() -> None:
     assert wilson_interval(0, 0) == (0.0, 1.0)  # nothing is known without trials
 
 
-def test_divergence() -> None:
-    position, orientation = np.array([4.9, 5.1, 1.0, np.nan]), np.array([29.0, 1.0, 31.0, 1.0])
-    assert diverged(position, orientation).tolist() == [False, True, True, True]
+def test_a_run_diverges_that_ends_above_a_limit_or_exceeds_it_again() -> None:
+    """Ends below; above in position, in orientation; unknown; a late start; an excursion; unknown at its end."""
+    last = np.array([[4.9, 5.1, 1.0, np.nan], [29.0, 1.0, 31.0, 1.0]])
+    assert diverged(last[0][None], last[1][None]).tolist() == [False, True, True, True]
+    position = np.array([[11.0, 33.0, 1.0, 0.1], [0.8, 25.0, 1.0, 0.1], [0.8, 1.0, 1.0, np.nan]]).T
+    assert diverged(position, np.ones_like(position)).tolist() == [False, True, False]
 
 
 @pytest.mark.parametrize("coordinates", list(Coordinates))

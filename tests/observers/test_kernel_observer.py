@@ -228,7 +228,7 @@ def lose(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any
 
 def test_an_estimate_that_is_no_number_ends_a_run() -> None:
     lost = Embedded("lost", lose, start_nothing, send_nothing)
-    with pytest.raises(CoopenvError, match=r"observer 'lost' of vehicle_1 at 0.\d+ s: its estimate is not finite"):
+    with pytest.raises(CoopenvError, match=r"observer 'lost' at vehicle_1 at 0.\d+ s: its estimate is not finite"):
         coopenv.run("overtaking", observer=lost, steps=5)
 
 

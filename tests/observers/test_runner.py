@@ -33,6 +33,7 @@ from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.helpers.recordings import completed
 from tests.helpers.recordings import simulated as recording
+from tests.helpers.sessions import ROOT, blocks
 from tests.oracles.batch import small_errors
 
 NAMES = sorted({*registry.ZOO} & {*registry.available_names(planar=False)})
@@ -164,7 +165,7 @@ def test_failures_end_in_a_word_not_in_a_crash() -> None:
             return super().update(tick)
 
     result = run(Breaks, recording())
-    assert re.fullmatch(r"of vehicle_3 at 0\.100 s: ZeroDivisionError: no gain \(test_runner\.py:\d+\)", result.failure)
+    assert re.fullmatch(r"at vehicle_3 at 0\.100 s: ZeroDivisionError: no gain \(test_runner\.py:\d+\)", result.failure)
     assert np.isfinite(result.position_error[6, :2]).all()
     assert np.isnan(result.position_error[6:, 2:]).all() and np.isnan(result.position_error[7:]).all()
 
@@ -198,7 +199,7 @@ def test_what_is_no_estimate_is_one_error_line(change: Any, said: str) -> None:
             return change(super().update(tick))
 
     failure = run(Odd, recording()).failure
-    assert "of vehicle_1 at 0.017 s" in failure and said in failure and "\n" not in failure
+    assert "at vehicle_1 at 0.017 s" in failure and said in failure and "\n" not in failure
 
 
 def test_a_sent_message_does_not_change_any_more() -> None:
@@ -234,7 +235,7 @@ def test_what_is_no_message_is_one_error_line(odd: Any, said: str) -> None:
 
 def test_an_observer_that_cannot_be_built_ends_its_run() -> None:
     failure = run("planar_robust", recording()).failure
-    assert failure.startswith("of vehicle_1 at 0.000 s: CoopenvError: PlanarRobust is for robots on a plane")
+    assert failure.startswith("at vehicle_1 at 0.000 s: CoopenvError: PlanarRobust is for robots on a plane")
 
 
 SENSED = ("rotation", "translation", "velocity", "angular_velocity", "targets", "bearings", "valid", "landmarks")
@@ -378,6 +379,23 @@ def test_observers_of_installed_packages(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "broken" in list_observers() and "broken" not in registry.available_names()
     assert "theirs" in registry.available_names() and not registry.obstacle("theirs")
     assert "no_such_module" in registry.obstacle("broken") and "\n" not in registry.obstacle("broken")
+
+
+def filters_of_the_documents() -> dict[str, Any]:
+    """Return the filters that readers copy, by the name of their source."""
+    page = next(block for block in blocks(ROOT / "docs" / "tutorials" / "own_observer.md") if block.file)
+    tutorial: dict[str, Any] = {}
+    exec(compile(page.code, "own_observer.md", "exec"), tutorial)
+    return {"tutorial": tutorial["Mine"], "example": runpy.run_path(str(ROOT / "examples" / "own_observer.py"))["Ekf"]}
+
+
+@pytest.mark.parametrize("seed", [0, 5])
+def test_filters_of_the_documents_have_no_excursion_at_the_start(seed: int) -> None:
+    made = record(load_scenario("busy_intersection_tracking", {"horizon": 0.5}), seed)
+    for name, factory in filters_of_the_documents().items():
+        result = run(factory, made)
+        assert not result.failure and result.position_error.max() < 3.0, name
+        assert result.coordinates is Coordinates.LEFT and 0.2 < np.median(result.nees[1:]) / 6.0 < 5.0, name
 
 
 @pytest.mark.slow

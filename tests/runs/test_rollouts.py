@@ -23,6 +23,7 @@ from coopenv.estimation.metrics import CONVERGED
 from coopenv.estimation.observability import Trajectory, analyse_observability
 from coopenv.policies import load_agent
 from coopenv.runs import Rollout, rollout
+from coopenv.runs.command import noise_note
 from coopenv.runs.console import gaps, legend, metrics_table, rates, remarks
 from coopenv.runs.recorder import drive_vehicles
 from coopenv.runs.rollouts import Ending, outcome_line, run_metrics, theory_rates, vehicle_metrics
@@ -386,3 +387,19 @@ def test_a_full_disk_is_found_before_anything_is_written(root: Path, monkeypatch
 def test_identities_that_are_none_are_refused(identity: str, root: Path) -> None:
     assert "expected NAMESPACE/NAME-v0" in refused("dataset", "facade", f"--id={identity}")
     assert not list(root.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("changes", "note"),
+    [
+        ({}, "noise on"),
+        ({"noise.enabled": False}, "noise off"),
+        ({"noise.bearing.scale": 0.0}, "no noise is set for bearings"),
+        (
+            {"noise.bearing.scale": 0.0, "noise.velocity": 0.0, "noise.angular_velocity": 0.0},
+            "no noise is set for bearings and odometry",
+        ),
+    ],
+)
+def test_the_header_of_a_run_names_sensors_without_noise(changes: dict[str, Any], note: str) -> None:
+    assert noise_note(coopenv.load_scenario("busy_intersection", changes)) == note

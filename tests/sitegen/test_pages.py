@@ -154,6 +154,9 @@ def test_every_page_with_programs_is_run() -> None:
     assert pages == PAGES.keys()
 
 
+CHAIN = ("mekf_covariance", "schmidt_kalman")
+
+
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(registry, "_registered", {})
@@ -176,6 +179,9 @@ def test_the_page_runs(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch)
             for name in program["found"].observers
         }
         assert mean["robust"] < mean["Mine"] < mean["riccati"] < mean["dead_reckoning"]
+        naive, mended = (np.array([row.anees for row in program["found"][name].rows]) for name in CHAIN)
+        assert (naive[1:4] > mended[1:4]).all() and mended[:4].max() < 1.5 < 3.0 < naive[3]  # as the page says
+        assert max(row.worst_after_start_m for row in program["found"]["Mine"].rows) < 3.0
         assert {"errors.png", "out"} <= {path.name for path in folder.iterdir()}
     elif page == "how-to/figures.md":
         drawn = {"figures": "pdf", "out/paper": "pdf", "out/springer": "svg"}

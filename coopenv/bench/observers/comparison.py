@@ -274,7 +274,8 @@ class Plan:
         groups = [self.observers] if self.source.seeded else [(name,) for name in self.observers]
         sent = [{name: portable(name) for name in group} for group in groups]
         made = product(self.variants, self._used, sent)
-        return [Task(self.source, *parts, self.steady_from, self.edges) for parts in made]
+        first = (self.variants[0], self._used[0])  # one record shows an observer's mistakes
+        return [Task(self.source, *parts, self.steady_from, self.edges, parts[:2] == first) for parts in made]
 
     @property
     def _used(self) -> tuple[int, ...]:

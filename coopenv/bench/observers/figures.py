@@ -75,7 +75,7 @@ def error_figure(board: Leaderboard, variant: str, width: float | None = None) -
         return None
     scene = board.samples[0].scene
     figure, inches = style.canvas(width, _FRAME + 1.05 * len(groups), f"{board.title}, {variant}")
-    shown = style.thinned(len(scene.vehicles), style.fitting(inches, 1.6, MOST_VEHICLES)).tolist()
+    shown = _shown(figure, board, style.fitting(inches, 1.6, MOST_VEHICLES))
     axes = figure.subplots(len(groups), len(shown), squeeze=False)
     for (name, own), line in zip(groups.items(), axes, strict=True):
         curves, bound = _curves(own), _bound(own)
@@ -118,7 +118,7 @@ def nees_figure(board: Leaderboard, variant: str, width: float | None = None) ->
     rows = -(-len(groups) // columns)
     figure, _ = style.canvas(width, _FRAME + 1.5 * rows, f"{board.title}, {variant}")
     axes = style.panels(figure, len(groups), columns)
-    shown = style.thinned(len(scene.vehicles), MOST_VEHICLES).tolist()
+    shown = _shown(figure, board, MOST_VEHICLES)
     for ax, (name, own) in zip(axes, groups.items(), strict=True):
         style.tidy(ax)
         ax.axhspan(*mean_bounds(dof, runs), color=SHADE, zorder=0)
@@ -136,6 +136,15 @@ def nees_figure(board: Leaderboard, variant: str, width: float | None = None) ->
     band = Patch(facecolor=SHADE, label=f"95 % of a consistent observer ($\\chi^2$, {runs_word}, at one instant)")
     style.legend_above(figure, [*vehicles, band])
     return figure
+
+
+def _shown(figure: Figure, board: Leaderboard, most: int) -> list[int]:
+    """Return the indices of at most so many vehicles; the figure's note states how many of them are shown."""
+    names = board.samples[0].scene.vehicles
+    shown: list[int] = style.thinned(len(names), most).tolist()
+    if len(shown) < len(names):
+        style.sign(figure, f"{len(shown)} of {len(names)} vehicles")
+    return shown
 
 
 def _share_axes(axes: np.ndarray, columns: int, t: np.ndarray) -> None:
@@ -320,6 +329,7 @@ def _document(board: Leaderboard) -> dict[str, Any]:
     points = int(np.clip(MOST_NUMBERS / curves, FEWEST_POINTS, MOST_POINTS))
     return {
         "vehicles": list(scene.vehicles),
+        "first": _worst(board, first),
         "observers": board.ranked,
         "colours": VEHICLE_COLOURS,
         "shown": SHOWN,
@@ -328,6 +338,13 @@ def _document(board: Leaderboard) -> dict[str, Any]:
         "variants": [_variant(board, name, points) for name in board.variants],
         "cost": _cost(board, first),
     }
+
+
+def _worst(board: Leaderboard, variant: str) -> int:
+    """Return the vehicle with the largest error after the start, of the observers that are shown at first."""
+    rows = [board.rows_in(variant, name) for name in board.ranked[:SHOWN]]
+    largest = np.array([[row.worst_after_start_m for row in own] for own in rows])
+    return int(np.nan_to_num(largest, nan=-1.0).max(axis=0).argmax())
 
 
 def _variant(board: Leaderboard, name: str, points: int) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.bench.executors import Executor, Local, Pool
+from coopenv.bench.observers.findings import findings_on
 from coopenv.bench.observers.sources import RecordSource
 from coopenv.estimation.metrics import (
     CONVERGED,
@@ -57,8 +58,8 @@ def windows_of(edges: Iterable[float], steady_from: float, end: float) -> tuple[
     return (*between, TimeWindow(steady_from, end, steady=True))
 
 
-BOUNDS = ("joint", "ancestors", "alone")
-"""Bounds of a vehicle's position: joint over all vehicles, over it and its ancestors, and with known neighbours."""
+BOUNDS = ("joint", "ancestors", "neighbours known")
+"""Bounds of a position: joint over all vehicles, over the vehicle and its ancestors, with given neighbours' poses."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,8 @@ class JudgedRun:
     series: Series
     stanford: Array
     """(B, B) vehicle ticks by horizontal error and protection level, both in bins of `LEVEL_BINS`; level known."""
+    findings: tuple[str, ...] = ()
+    """Mistakes of the observer, see `findings_on`; empty where it was not examined."""
 
     def measured(self, name: str) -> Array:
         """Return the figures of the vehicles; NaN where the observer failed, which counts as diverged."""
@@ -221,6 +224,8 @@ class Task:
     steady_from: float | None
     edges: tuple[float, ...] = ()
     """Edges of the windows that are judged one by one, s."""
+    examined: bool = False
+    """Whether mistakes of the observers are sought, too."""
 
     @property
     def world(self) -> tuple[RecordSource, str]:
@@ -237,7 +242,10 @@ class Task:
                 dof = len(PLANAR_STATES) if recording.on_a_plane else 6
                 yield failed_run(self.variant, name, scene, dof, ended[name], {})
             else:
-                yield sample_of(self.variant, name, scene, recording, run(factory, recording))
+                result = run(factory, recording)
+                sample = sample_of(self.variant, name, scene, recording, result)
+                found = findings_on(factory, recording, result, scene.steady_from) if self.examined else ()
+                yield replace(sample, findings=found)
 
 
 def judge(task: Task) -> list[JudgedRun]:
@@ -291,6 +299,17 @@ def horizontal_error(recording: Recording, result: Run) -> Array:
     return np.asarray(np.linalg.norm(offset, axis=-1))
 
 
+START = 1.0  # s; the largest error is judged after it, because the first estimates are drawn
+
+
+def largest_after_start(t: Array, error: Array) -> Array:
+    """Return (N,) the largest of errors (K, N) after `START`; NaN where no error is known."""
+    after = error[t > START]
+    return np.where(
+        np.isfinite(after).any(axis=0), np.nan_to_num(after, nan=-np.inf).max(axis=0, initial=-np.inf), np.nan
+    )
+
+
 def level_measures(error: Array, result: Run) -> dict[str, Array]:
     """Return the figures of the protection levels (N,), over the whole run; NaN where none is stated.
 
@@ -324,7 +343,8 @@ def _measures(scene: RecordProperties, recording: Recording, result: Run) -> dic
         "anees": np.array([result.anees_in(ticks) for ticks in windows]).T,
         "nis": np.where(dof > 0, result.nis, 0.0).sum(axis=0),
         "nis_dof": dof.sum(axis=0).astype(float),
-        "diverged": diverged(*map(_last, errors)),
+        "worst": largest_after_start(result.t, errors[0]),
+        "diverged": diverged(*errors),
         **level_measures(horizontal_error(recording, result), result),
     }
     single = [_vehicle_measures(recording, result, i) for i in range(len(recording.setups))]
@@ -346,10 +366,3 @@ def _vehicle_measures(recording: Recording, result: Run, i: int) -> dict[str, fl
     ate = absolute_error(truth.position[:, i], result.position[:, i])
     found = {"settle_time": settled, "converge_time": converged, "rate": rate, "ate": ate}
     return found | {"rpe": relative.position, "rpe_orientation": relative.orientation}
-
-
-def _last(error: Array) -> Array:
-    """Return (N,) the last error that is known."""
-    known = np.isfinite(error)
-    last = len(error) - 1 - np.argmax(known[::-1], axis=0)
-    return np.asarray(error[last, np.arange(error.shape[1])])

@@ -16,7 +16,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.bench.observers.convergence import Basin, Draw, basins_of
 from coopenv.bench.observers.faults import NOMINAL
-from coopenv.bench.observers.judge import RELATIVE_DELTA, JudgedRun, TimeWindow
+from coopenv.bench.observers.judge import RELATIVE_DELTA, START, JudgedRun, TimeWindow
 from coopenv.estimation.metrics import (
     CONVERGED,
     DIVERGED_ORIENTATION,
@@ -114,7 +114,7 @@ class Row:
     us_per_update: float = _column("median time of an update with its message, microseconds; depends on the machine")
     failure: str = _column("first vehicle that failed, when and why; empty without a failure")
     bound_ancestors_m: float = _column("the bound joint over the vehicle and all whose messages can reach it, m")
-    bound_single_m: float = _column("the bound of the vehicle alone, as if its neighbours' poses were known, m")
+    bound_neighbours_known_m: float = _column("the bound of the vehicle with the poses of its neighbours given, m")
     ratio_to_bound: float = _column("position_rmse_m / bound_m")
     ratio_to_bound_se: float = _column("standard error of ratio_to_bound, the bound taken as exact")
     ratio_to_bound_ancestors: float = _column("position_rmse_m / bound_ancestors_m")
@@ -129,8 +129,12 @@ class Row:
         "median over seeds of the Theil-Sen slope of -log of the error's descent, 1/s"
     )
     diverged_fraction: float = _column(
-        f"share of seeds that end above {DIVERGED_POSITION:g} m or {DIVERGED_ORIENTATION:g} deg, or that failed"
+        f"share of seeds in which the errors never get below {DIVERGED_POSITION:g} m and {DIVERGED_ORIENTATION:g} deg, "
+        "or exceed one of them again, and of those that failed"
     )
+    worst_after_start_m: float = _column(f"largest position error of all seeds after the first {START:g} s, m")
+    verdict: str = _column("consistent, overconfident or underconfident by anees_low and anees_high; or no covariance")
+    finding: str = _column("mistakes of the observer in the first seed of the first variant, such as a wrong frame")
     ate_m: float = _column("absolute trajectory error over the whole run (evo's APE, nothing aligned), m")
     rpe_m: float = _column(f"relative trajectory error (evo's RPE) over {RELATIVE_DELTA:g} s, m")
     rpe_deg: float = _column(f"its angle over {RELATIVE_DELTA:g} s, deg")
@@ -168,7 +172,11 @@ ERRORS = {
 }
 """Column to that of its standard error."""
 
-BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", "bound_single_m": "bound (alone)"}
+BOUNDS = {
+    "bound_m": "bound (joint)",
+    "bound_ancestors_m": "bound (ancestors)",
+    "bound_neighbours_known_m": "neighbours known",
+}
 """Column to its line in tables."""
 
 
@@ -222,6 +230,9 @@ def row_of(
         convergence_time_s=median_of(seeds("converge_time")),
         convergence_rate_per_s=median_of(seeds("rate")),
         diverged_fraction=float(np.mean(seeds("diverged"))),
+        worst_after_start_m=float(np.max(seeds("worst"))),
+        verdict="" if any(sample.failure for sample in own) else verdict_of(float(np.mean(anees)), honest),
+        finding=", ".join(own[0].findings),
         ate_m=root("ate"),
         rpe_m=root("rpe"),
         rpe_deg=root("rpe_orientation"),
@@ -275,6 +286,28 @@ def window_row_of(environment: str, own: Sequence[JudgedRun], i: int, w: int) ->
         "to_s": window.end,
     }
     return WindowRow(**{column.name: known[column.name] for column in fields(WindowRow)})
+
+
+NO_COVARIANCE, CONSISTENT, OVERCONFIDENT, UNDERCONFIDENT = VERDICTS = (
+    "no covariance",
+    "consistent",
+    "overconfident",
+    "underconfident",
+)
+
+
+def verdict_of(anees: float, consistent: Interval) -> str:
+    """Return the verdict on a covariance by its ANEES and the interval of a consistent filter; NaN: none is stated."""
+    if math.isnan(anees):
+        return NO_COVARIANCE
+    return OVERCONFIDENT if anees > consistent.high else UNDERCONFIDENT if anees < consistent.low else CONSISTENT
+
+
+def verdict_on(rows: Sequence[Row]) -> str:
+    """Return the worst verdict on an observer's vehicles, and of how many: an overconfident one comes first."""
+    found = [row.verdict for row in rows]
+    worst = next((word for word in (OVERCONFIDENT, UNDERCONFIDENT, NO_COVARIANCE) if word in found), CONSISTENT)
+    return worst if len(set(found)) == 1 else f"{worst} {found.count(worst)}/{len(found)}"
 
 
 class Spread(NamedTuple):

@@ -21,6 +21,7 @@ from coopenv.bench.observers.rows import (
     WindowRow,
     spread,
     standard_error,
+    verdict_on,
 )
 from coopenv.bench.observers.sources import Robots
 from coopenv.estimation.metrics import SETTLED, mean_or_nan
@@ -53,6 +54,9 @@ def quality(board: Leaderboard, variant: str, observer: str) -> dict[str, Any]:
         "time": measured(each("us_per_update").mean(axis=1)),
         "nis": measured(each("nis").sum(axis=1) / np.where(dof > 0, dof, np.nan)),
         "stated": sorted((row for row in rows if np.isfinite(row.anees)), key=lambda row: row.anees),
+        "verdict": verdict_on(rows),
+        "finding": rows[0].finding or "-",
+        "worst": largest_error(rows),
         **{f"worst_{column}": spread(rows, column) for column in ("ratio_to_bound_ancestors", "anees")},
     }
 
@@ -66,7 +70,7 @@ def headline(board: Leaderboard) -> list[str]:
     best = quality(board, first, names[0])
     lines = [
         f"Best of {len(board.observers)} in {board.title} ({first}): {names[0]}, "
-        f"mean position RMSE {_words(board.totals[first, names[0]].rmse)} m in the steady state"
+        f"mean position RMSE {_words(board.totals[first, names[0]].rmse)} m in the steady state, {best['verdict']}"
     ]
     if (ratio := best["worst_ratio_to_bound_ancestors"]).vehicle:
         lines[0] += f", {_words(Measured(*ratio[1:3]))} times the Cramér-Rao bound at worst ({ratio.vehicle})"
@@ -121,6 +125,8 @@ def everything(board: Leaderboard, width: int = WIDTH) -> Iterator[Table | str]:
             yield ratio_table(board, variant)
         yield ""
         yield quality_table(board, variant)
+        yield ""
+        yield consistency_table(board, variant)
         if line := honest_line(board.rows):
             yield line
         if (levels := level_table(board, variant)).row_count:
@@ -208,21 +214,44 @@ def honest_line(rows: Sequence[Row]) -> str:
 
 
 def quality_table(board: Leaderboard, variant: str) -> Table:
-    """Return, of one variant over all vehicles: shares that settle, consistency (1: consistent) and costs."""
-    headings = ["settled", "converged", "diverged", "ANEES\nbest", "ANEES\nworst", "NIS", "sent\nB/s", "us"]
+    """Return, of one variant over all vehicles: shares that settle, the largest error of a vehicle, costs."""
+    headings = ["settled", "converged", "diverged", "worst after\nstart [m]", "sent\nB/s", "us"]
 
     def cells(own: list[Row]) -> list[str]:
-        stated = sorted((row for row in own if np.isfinite(row.anees)), key=lambda row: row.anees)
-        nis = [row.nis for row in own if np.isfinite(row.nis)]
         shares = ("settled_fraction", "converged_fraction", "diverged_fraction")
         return [
             *(f"{100 * mean_of(own, column):.0f}%" for column in shares),
-            *([number(stated[0].anees, 2), compact(stated[-1].anees, stated[-1].anees_se)] if stated else ["-", "-"]),
-            number(float(np.mean(nis)), 2) if nis else "-",
+            number(largest_error(own), 2),
             *(f"{mean_of(own, column):.0f}" for column in ("bytes_per_s", "us_per_update")),
         ]
 
     return _add_observers(number_table(["observer"], headings, gap=0), board, variant, cells)
+
+
+def largest_error(rows: Sequence[Row]) -> float:
+    """Return the largest error after the start of all vehicles, m; NaN where no vehicle has one."""
+    return max((row.worst_after_start_m for row in rows if np.isfinite(row.worst_after_start_m)), default=np.nan)
+
+
+def consistency_table(board: Leaderboard, variant: str) -> Table:
+    """Return, of one variant over all vehicles: the verdict on their covariances, ANEES and NIS (1: consistent)."""
+    headings = ["verdict", "ANEES\nlowest", "\nhighest", "\nof", "NIS", "finding"]
+
+    def cells(own: list[Row]) -> list[str]:
+        stated = sorted((row for row in own if np.isfinite(row.anees)), key=lambda row: row.anees)
+        nis = [row.nis for row in own if np.isfinite(row.nis)]
+        highest = [compact(stated[-1].anees, stated[-1].anees_se), _short(stated[-1].vehicle)] if stated else ["-", "-"]
+        lowest = number(stated[0].anees, 2) if stated else "-"
+        finding = own[0].finding.replace(", ", "\n") or "-"
+        innovations = number(float(np.mean(nis)), 2) if nis else "-"
+        return [verdict_on(own).replace(" ", "\n"), lowest, *highest, innovations, finding]
+
+    return _add_observers(number_table(["consistency"], headings, gap=0), board, variant, cells)
+
+
+def _short(vehicle: str) -> str:
+    """Return the name of a vehicle, the paper's where it has one."""
+    return vehicle.replace("vehicle_", "f")
 
 
 LEVELS = {
@@ -305,7 +334,7 @@ def summary(board: Leaderboard, variant: str) -> Table:
 def _spread(rows: Sequence[WindowRow], column: str, digits: int) -> list[str]:
     """Return the median vehicle's figure, the worst one's, and which vehicle that is."""
     found = spread(rows, column)
-    return [number(found.median, digits), compact(found.worst, found.error), found.vehicle.replace("vehicle_", "f")]
+    return [number(found.median, digits), compact(found.worst, found.error), _short(found.vehicle)]
 
 
 def variant_table(board: Leaderboard, heading: str, column: str, variants: Sequence[str]) -> Table:
@@ -329,12 +358,13 @@ def failures(rows: Sequence[Row]) -> list[str]:
 
 
 def latex(board: Leaderboard, variant: str) -> str:
-    """Return position RMSE per vehicle in m with standard errors as a LaTeX table.
+    """Return position RMSE per vehicle in m with standard errors, largest errors and verdicts as a LaTeX table.
 
     Five vehicles fit a column of 3.5 in.
     """
     texts = environment(trim_blocks=True, keep_trailing_newline=True)
     texts.filters["cell"] = lambda r: FAILED if r.failure else compact(r.position_rmse_m, r.position_rmse_se_m)
+    texts.filters["judged"] = _judged
     texts.globals["stacked"] = _latex_name
     bounds = {BOUNDS[c]: [number(v, 3) for v in values] for c, values in board.bounds_in(variant).items()}
     values = {"board": board, "variant": variant, "headings": _headings(board), "bounds": bounds}
@@ -345,6 +375,12 @@ def environment(**options: Any) -> Environment:
     """Return the renderer of the templates beside the report's."""
     loader = PackageLoader("coopenv.bench.observers", "page")
     return Environment(loader=loader, undefined=StrictUndefined, **options)
+
+
+def _judged(rows: Sequence[Row]) -> str:
+    """Return the largest error after the start and the verdict of an observer, in words."""
+    failed = any(row.failure for row in rows)
+    return FAILED if failed else f"{number(largest_error(rows), 2)} m, {verdict_on(rows)}"
 
 
 def _latex_name(name: str) -> str:

@@ -18,15 +18,16 @@ from scipy.stats import chi2
 
 import coopenv
 from coopenv.base.errors import CoopenvError
-from coopenv.base.format import in_parentheses, with_error
+from coopenv.base.format import in_parentheses, number, with_error
 from coopenv.bench.observers import compare, find_source
 from coopenv.bench.observers.command import report_text
 from coopenv.bench.observers.comparison import Plan
 from coopenv.bench.observers.faults import VARIANTS
+from coopenv.bench.observers.figures import _document, page_file
 from coopenv.bench.observers.judge import sample_of, scene_of
-from coopenv.bench.observers.rows import Leaderboard, Row
+from coopenv.bench.observers.rows import Leaderboard, Row, verdict_on
 from coopenv.bench.observers.sources import variants_of
-from coopenv.bench.observers.tables import everything, failures
+from coopenv.bench.observers.tables import everything, failures, largest_error
 from coopenv.cli.bench import ObserverOptions
 from coopenv.observers import registry, run
 from coopenv.observers.pose_filters import DeadReckoning
@@ -139,9 +140,11 @@ def test_csv_and_latex(comparison: coopenv.Comparison, tmp_path: Path) -> None:
     assert (tmp_path / "rows.tex").read_text() == text
     row = comparison.rows_in("nominal", "riccati")[0]
     assert in_parentheses(row.position_rmse_m, row.position_rmse_se_m) in text
-    assert r" & f1 & f2 \\" in text and text.count(r"\\") == 1 + 3 + 3
+    assert r" & f1 & f2 \\" in text and text.count(r"\\") == 1 + 3 + 3 + 1 + 3
     body = [line for line in text.splitlines() if "&" in line]
-    assert [line.count("&") for line in body] == [2] * len(body)
+    assert [line.count("&") for line in body] == [2] * 7 + [1] * 4
+    riccati = comparison.rows_in("nominal", "riccati")
+    assert f"riccati & \\multicolumn{{2}}{{l}}{{{number(largest_error(riccati), 2)} m, {verdict_on(riccati)}}}" in text
     assert r"Raises & failed & failed \\" in text
 
 
@@ -201,6 +204,19 @@ def test_figures_say_what_they_show(comparison: coopenv.Comparison, kind: str, w
     assert "riccati" in words and ("Raises" in words) == (kind == "variants")
     if kind == "variants":
         assert {"better", "worse"} <= {figure.axes[1].get_xlabel(), figure.axes[1].get_title()}
+
+
+def test_a_narrow_figure_states_how_many_vehicles_it_shows() -> None:
+    found = compare("dead_reckoning", "busy_intersection", 1, overrides={"horizon": 0.5})
+    assert "4 of 5 vehicles" in found.figure("errors", width=7.0).get_supxlabel()
+    assert "vehicles" not in found.figure("errors", width=10.0).get_supxlabel()
+
+
+def test_the_report_opens_with_the_worst_vehicle() -> None:
+    found = compare("dead_reckoning", "busy_intersection_tracking", 1, overrides={"horizon": 1.2})
+    worst = max(range(5), key=lambda i: found.rows[i].worst_after_start_m)
+    assert _document(found)["first"] == worst != 0
+    assert ".value = data.first" in page_file("charts.js").decode()
 
 
 def test_mistakes(comparison: coopenv.Comparison, tmp_path: Path) -> None:

@@ -18,9 +18,21 @@ import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers import compare, judge
 from coopenv.bench.observers.judge import LEVEL_BINS, TimeWindow, level_measures, windows_of
-from coopenv.bench.observers.rows import EDGES, UNKNOWN, WindowRow, checked_edges, mean_root, ratio, row_of, spread
+from coopenv.bench.observers.rows import (
+    EDGES,
+    UNKNOWN,
+    WindowRow,
+    checked_edges,
+    mean_root,
+    ratio,
+    row_of,
+    spread,
+    verdict_of,
+    verdict_on,
+)
 from coopenv.bench.observers.tables import level_figures
 from coopenv.cli.app import main
+from coopenv.estimation.metrics import Interval
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao, cramer_rao_ancestors
 from coopenv.observers.runner import Run
@@ -66,7 +78,7 @@ def test_rows_have_the_bounds_of_the_runs(found: coopenv.Comparison) -> None:
     assert_allclose([row.position_rmse_median_m for row in found.rows], median, rtol=1e-12)
     for row in found.rows:
         assert row.ratio_to_bound == pytest.approx(row.position_rmse_m / row.bound_m)
-        assert max(row.bound_m, row.bound_single_m) <= row.bound_ancestors_m * (1 + 1e-9)
+        assert max(row.bound_m, row.bound_neighbours_known_m) <= row.bound_ancestors_m * (1 + 1e-9)
         assert row.degradation == pytest.approx(1.0) and row.gramian_min_eigenvalue >= 0.0
 
 
@@ -75,6 +87,25 @@ def test_the_steady_window_is_the_leaderboard(found: coopenv.Comparison) -> None
         assert row.position_rmse_m == steady.position_rmse_m and row.anees == steady.anees
         assert row.anees_se == steady.anees_se > 0.0
         assert row.ratio_to_bound_ancestors_se == steady.ratio_to_bound_ancestors_se
+
+
+def test_the_worst_error_and_the_verdict_are_those_of_the_runs(found: coopenv.Comparison) -> None:
+    scenario = coopenv.load_scenario("lane:4", SHORT)
+    errors = np.array([run("mekf_covariance", record(scenario, seed)).position_error for seed in (0, 1, 2)])
+    late = found.groups["nominal", "mekf_covariance"][0].scene.windows[-1].end - 2.0  # START is 1 s of 3 s
+    after = errors[:, np.arange(errors.shape[1]) / 20.0 > late]
+    assert_allclose([row.worst_after_start_m for row in found.rows], after.max(axis=(0, 1)), rtol=1e-9)
+    for row in found.rows:
+        word = "over" if row.anees > row.anees_high else "under"
+        assert row.verdict == ("consistent" if row.anees_low <= row.anees <= row.anees_high else f"{word}confident")
+
+
+def test_the_verdict_on_an_observer_is_the_worst_of_its_vehicles(found: coopenv.Comparison) -> None:
+    words = ["consistent", "overconfident", "overconfident", "underconfident"]
+    rows = [replace(row, verdict=word) for row, word in zip(found.rows, words, strict=True)]
+    assert verdict_on(rows) == "overconfident 2/4" and verdict_on(rows[:1]) == "consistent"
+    assert verdict_on(rows[3:]) == "underconfident"
+    assert verdict_of(np.nan, Interval(0.8, 1.2)) == "no covariance"
 
 
 def test_fewer_degrees_of_freedom_than_seeds_have_no_bounds(found: coopenv.Comparison) -> None:

@@ -62,6 +62,7 @@
     };
     const variantOf = choice(`${kind}-variant`, data.variants.map((v) => v.name), redraw);
     const vehicleOf = choice(`${kind}-vehicle`, data.vehicles, redraw);
+    document.getElementById(`${kind}-vehicle`).value = data.first;
     redraw();
   };
   overTime("errors", "position error [m]", (variant, vehicle) => (variant.bound[vehicle].some((v) => v !== null)
