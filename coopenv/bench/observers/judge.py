@@ -28,6 +28,7 @@ from coopenv.estimation.observability import RecordedGeometry, analyse_observabi
 from coopenv.estimation.poses import Array
 from coopenv.observers.bound import Bound, cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Factory
+from coopenv.observers.isolation import started
 from coopenv.observers.recording import Recording, Truth
 from coopenv.observers.runner import PLANAR_STATES, Run, run
 
@@ -217,7 +218,7 @@ class Task:
     variant: str
     seed: int
     observers: Mapping[str, str | Factory]
-    """Observers by name, as `registry.find` accepts them in another process."""
+    """Observers by name, as `registry.find` accepts them in another process, or `Isolated` ones."""
     steady_from: float | None
     edges: tuple[float, ...] = ()
     """Edges of the windows that are judged one by one, s."""
@@ -237,7 +238,9 @@ class Task:
                 dof = len(PLANAR_STATES) if recording.on_a_plane else 6
                 yield failed_run(self.variant, name, scene, dof, ended[name], {})
             else:
-                yield sample_of(self.variant, name, scene, recording, run(factory, recording))
+                with started(factory) as observer:
+                    result = run(observer, recording)
+                yield sample_of(self.variant, name, scene, recording, result)
 
 
 def judge(task: Task) -> list[JudgedRun]:
