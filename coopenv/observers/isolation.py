@@ -86,7 +86,8 @@ class ObserverProcess(ChildProcess):
             self.pipe.send_bytes(data.getvalue())
             found, failure = json.loads(self.pipe.recv_bytes(MOST_ANSWERED), object_hook=_unpacked)
         except Exception as error:
-            whose, why = f"'{self.reference}': " if request[0] == "load" else "", f"{error}; " if str(error) else ""
+            whose = f"'{self.reference}' cannot be loaded: " if request[0] == "load" else ""
+            why = f"{error}; " if str(error) else ""
             raise ObserverError(f"{whose}{why}{self.end()}") from None
         if failure:
             raise ObserverError(" ".join(str(failure)[:1000].split()))

@@ -184,5 +184,5 @@ def test_answers_that_cannot_be_read_end_the_process(two: Recording, tmp_path: P
 
 def test_an_observer_that_ends_while_it_is_loaded_is_named(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("import os\nos._exit(0)\nMine = 0\n")
-    with pytest.raises(CoopenvError, match=r"mine\.py:Mine': its process ended with status 0$"):
+    with pytest.raises(CoopenvError, match=r"mine\.py:Mine' cannot be loaded: its process ended with status 0$"):
         load(f"{tmp_path / 'mine.py'}:Mine")
