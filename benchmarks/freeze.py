@@ -1,4 +1,8 @@
-"""`python -m benchmarks.freeze v1`: record the actions of the drivers of a frozen benchmark, before its first run."""
+"""`python -m benchmarks.freeze v1`: record the actions of the drivers of a frozen benchmark, before its first run.
+
+The definition is written first. Then `coopenv bench v1` with the main observers of the zoo makes
+the file of the shipped rows.
+"""
 
 import argparse
 import sys

@@ -6,17 +6,14 @@ system on the address space would end numerical libraries as well. Processes end
 their parent.
 """
 
-import multiprocessing
 import os
 import pickle
-import signal
 import socket
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from time import monotonic
 from typing import Any, TypeVar
@@ -29,11 +26,11 @@ from coopenv.base.installation import (
     available_cores,
     environment,
     install_command,
-    is_reference,
     load_reference,
     needing,
 )
-from coopenv.base.interrupts import end_with_parent, held
+from coopenv.base.interrupts import end_with_parent
+from coopenv.base.processes import ChildProcess
 
 POLL = 0.1  # s between two looks at the processes
 PATIENCE = 10.0
@@ -50,20 +47,6 @@ class ProcessLimits:
     """Limit of processor time, s."""
     mebibytes: float = 8192.0
     """Limit of memory, MiB, besides the earlier use of its process."""
-
-
-@contextmanager
-def _deaf_children() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C, which a terminal sends to all: the parent decides."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    resource_tracker.ensure_running()  # would start with the first process, and lets signals through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _work(pipe: Connection) -> None:
@@ -89,17 +72,11 @@ def _work(pipe: Connection) -> None:
                 pipe.send(CoopenvError(error_text(error)))
 
 
-class _Worker:
+class _Worker(ChildProcess):
     """A process, and how far it is with a task."""
 
     def __init__(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.pipe, other = context.Pipe()
-        self.process = context.Process(target=_work, args=(other,))
-        with held(), _deaf_children():
-            self.process.start()
-        other.close()
-        self.usage = psutil.Process(self.process.pid)
+        super().__init__(_work)
         self.number = -1  # of its task; negative: it is idle
         self.started = False  # whether the parts have begun
         self.before = (0.0, 0.0, 0.0)  # as `measured`, when the present part began
@@ -120,17 +97,6 @@ class _Worker:
             if memory > limits.mebibytes:
                 return f"more than {limits.mebibytes:g} MiB of memory (--memory)", ""
         return None
-
-    def end(self) -> str:
-        """Kill it and the processes that it has started, and return how it ended."""
-        with suppress(psutil.Error):
-            for child in self.usage.children(recursive=True):
-                child.kill()
-        self.process.kill()
-        self.process.join()
-        self.pipe.close()
-        status = int(self.process.exitcode or 0)
-        return f"its process ended with {signal.Signals(-status).name if status < 0 else f'status {status}'}"
 
 
 class Pool:
@@ -338,19 +304,20 @@ class Ray:
 Executor = Local | Ray
 
 
-def check_imports(executor: Executor, observers: Sequence[str]) -> None:
-    """Load import paths in other processes first, under the limits of an executor that has some.
+def _load(reference: str) -> None:
+    load_reference(reference)
+
+
+def check_imports(executor: Executor, observers: Sequence[str], load: Callable[[str], Any] = _load) -> list[Any]:
+    """Load observers in other processes first, under the limits of an executor that has some; return what `load` does.
 
     Raises:
         CoopenvError: one cannot be loaded, ends its process or exceeds a limit.
     """
-    if isinstance(executor, Local) and executor.limits is not None:
-        tasks = [_Whole(_load, name) for name in observers if is_reference(name)]
-        Pool(tasks, executor.jobs, executor.limits).run(lambda done: None)
-
-
-def _load(reference: str) -> None:
-    load_reference(reference)
+    if not isinstance(executor, Local) or executor.limits is None:
+        return []
+    tasks = [_Whole(load, name) for name in observers]
+    return [found for [found] in Pool(tasks, executor.jobs, executor.limits).run(lambda done: None)]
 
 
 def find_executor(

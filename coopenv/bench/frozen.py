@@ -5,7 +5,6 @@ depend on drivers, which may change. `v1.json` is the result file of the zoo: re
 figures of records agree with it.
 """
 
-import inspect
 import json
 import math
 import tomllib
@@ -23,24 +22,29 @@ from rich.table import Table
 
 from coopenv.base.errors import CoopenvError, ScenarioWarning, check_one_of, listed
 from coopenv.base.format import in_parentheses, jsonable, number
-from coopenv.base.installation import data_directory, is_reference, versions
+from coopenv.base.installation import data_directory, versions
 from coopenv.bench.executors import Local, ProcessLimits, check_imports
 from coopenv.bench.observers.comparison import Comparison, Plan
 from coopenv.bench.observers.faults import NOMINAL
-from coopenv.bench.observers.judge import judge_all
+from coopenv.bench.observers.judge import Task, judge_all
 from coopenv.bench.observers.rows import median_of, spread
 from coopenv.bench.observers.sources import SimulatedRecords, find_source
 from coopenv.bench.observers.tables import mean_of, short_name
 from coopenv.estimation.metrics import DIVERGED_POSITION
-from coopenv.observers.registry import find, named
+from coopenv.observers.isolation import Isolated, load
+from coopenv.observers.registry import ZOO, check_known, find, list_observers
 from coopenv.runs.console import number_table
 
 FOLDER = Path(__file__).parent
 TOLERANCE = 1e-3
 """Relative, of the figures of records: other processors round differently."""
+LEAST_SHARE = 0.9
+"""Least error of a row, as a share of the bound, or of the best shipped row where it is below the bound."""
+LEAST_ANEES = 0.16
+"""Least median of the ANEES over scenes: the quantile 1e-6 of chi-square with 24 degrees of freedom, 6 per seed."""
 COSTS = ("anees_median", "anees_worst", "bytes_per_s", "us_per_update")
 """Columns whose totals are medians over the scenes."""
-SHOWN = ("robust", "split_covariance_intersection")
+SHOWN = ("robust", "schmidt_kalman")
 """Observers of the zoo beside the new one in the table of scenes."""
 
 
@@ -127,17 +131,22 @@ class Frozen:
     ) -> dict[str, Any]:
         """Return the content of the result file of observers in some scenes, all without names."""
         scenes, share, executor = self.scenes(names), self.definition["steady_from"], Local(jobs, limits)
-        check_imports(executor, observers)
-        plans = [
-            Plan.of(observers, s.source, self.seeds, [s.variant], share * s.source.scenario.horizon, ()) for s in scenes
-        ]
-        tasks = [task for plan in plans for task in plan.tasks]
+        chosen = _by_name(observers)
+        own = {name: observer for name, observer in chosen.items() if name not in ZOO}
+        loaded = dict(zip(own, check_imports(executor, [*own.values()], load), strict=True))
+        files = {name: digest for name, (_, digest) in loaded.items()}
+        sent = {name: Isolated(observer) if name in own else observer for name, observer in chosen.items()}
+        steady = {s.name: share * s.source.scenario.horizon for s in scenes}
+        tasks = [Task(s.source, s.variant, seed, sent, steady[s.name]) for s in scenes for seed in self.seeds]
+        plans = {s.name: Plan(s.source, (*sent,), (s.variant,), (*self.seeds,), None) for s in scenes}
         judged = iter(judge_all(executor, tasks, lambda done: on_progress(done / len(tasks))))
-        boards = {s.name: p.compared(islice(judged, len(self.seeds))) for s, p in zip(scenes, plans, strict=True)}
+        boards = {name: plan.compared(islice(judged, len(self.seeds))) for name, plan in plans.items()}
         found = {s.name: {"hash": s.hash, "records": _figures(boards[s.name])} for s in scenes}
-        rows = [row_of(name, board, observer) for name, board in boards.items() for observer in board.observers]
-        files = {named(name): _digest_of(name) for name in observers if is_reference(name)}
-        remarks = self._remarks(found, limits)
+        joint = {name for name in chosen if (loaded[name][0] if name in own else hasattr(find(name), "joint"))}
+        rows = [row_of(name, board, one, one in joint) for name, board in boards.items() for one in board.observers]
+        refused = self.refused(rows)
+        rows = [row for row in rows if row["observer"] not in refused]
+        remarks = [*refused.values(), *self._remarks(found, limits)]
         result = {
             "benchmark": self.version,
             "definition": self.digest,
@@ -149,6 +158,7 @@ class Frozen:
             "seeds": [*self.seeds],
             "scenes": found,
             "rows": rows,
+            "refused": refused,
             "totals": totals_of(rows),
         }
         return dict(jsonable(result))
@@ -157,6 +167,23 @@ class Frozen:
     def digest(self) -> str:
         """SHA-256 of the definition."""
         return sha256(self._text.encode()).hexdigest()
+
+    def refused(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+        """Return why observers of users are refused: errors, or a NEES, that measurements do not make possible."""
+        least: dict[str, float] = {}
+        for row in self.zoo["rows"]:
+            least[row["scene"]] = min(row["rmse_m"], least.get(row["scene"], math.inf))
+        refused = {}
+        for observer in {row["observer"] for row in rows} - ZOO.keys():
+            own = [row for row in rows if row["observer"] == observer and not row["failure"]]
+            if (anees := median_of(row["anees_median"] for row in own)) is not None and anees < LEAST_ANEES:
+                why = f"ANEES {anees:.2g} is below {LEAST_ANEES:g}: state a smaller covariance, or none"
+                refused[observer] = f"{observer} refused: {why}"
+            for row in own:
+                if row["rmse_m"] < (limit := LEAST_SHARE * min(row["bound_m"], least.get(row["scene"], math.inf))):
+                    why = f"{row['rmse_m']:.2g} m in {row['scene']} is below {limit:.2g} m"
+                    refused[observer] = f"{observer} refused: {why}, {LEAST_SHARE:g} of the bound"
+        return refused
 
     def _remarks(self, found: Mapping[str, Any], limits: ProcessLimits) -> list[str]:
         """Return why a result is not comparable with that of the zoo; empty where it is."""
@@ -175,14 +202,28 @@ class Frozen:
         return remarks
 
 
+def _by_name(observers: Sequence[str]) -> dict[str, str]:
+    """Return observers by name, without running their code. Raises CoopenvError: unknown, or two of one name."""
+    chosen: dict[str, str] = {}
+    for observer in dict.fromkeys(observers):
+        check_known(observer)
+        place, colon, name = observer.rpartition(":")
+        if name in {*chosen, *(list_observers() if colon else ())}:
+            name = f"{Path(place.removesuffix('.py').replace('.', '/')).name}.{name}"
+        if name in chosen:
+            raise CoopenvError(f"two observers are named '{name}': rename the class")
+        chosen[name] = observer
+    return chosen
+
+
 def _figures(board: Comparison) -> list[float]:
     """Return the mean figures of the records of all seeds."""
     figures = [sample.scene.figures for sample in board.samples if sample.observer == board.observers[0]]
     return [float(f"{value:.7g}") for value in np.mean(figures, axis=0)]
 
 
-def row_of(scene: str, board: Comparison, observer: str) -> dict[str, Any]:
-    """Return the row of one observer in one scene; null where it failed."""
+def row_of(scene: str, board: Comparison, observer: str, joint: bool) -> dict[str, Any]:
+    """Return the row of one observer in one scene; null where it failed. A joint one has another bound."""
     variant = next(iter(board.variants))
     rows = board.rows_in(variant, observer)
     rmse, position, anees = board.totals[variant, observer].rmse, spread(rows, "position_rmse_m"), spread(rows, "anees")
@@ -196,7 +237,7 @@ def row_of(scene: str, board: Comparison, observer: str) -> dict[str, Any]:
         "worst_se_m": position.error,
         "worst_vehicle": position.vehicle,
         "orientation_deg": mean_of(rows, "orientation_rmse_deg"),
-        "bound_m": mean_of(rows, "bound_ancestors_m"),
+        "bound_m": mean_of(rows, "bound_m" if joint else "bound_ancestors_m"),
         "anees_median": anees.median,
         "anees_worst": anees.worst,
         "bytes_per_s": mean_of(rows, "bytes_per_s"),
@@ -274,11 +315,3 @@ def package_digest() -> str:
         for path in sorted(path for kind in ("py", "toml", "safetensors") for path in folder.rglob(f"*.{kind}")):
             digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
     return digest.hexdigest()
-
-
-def _digest_of(reference: str) -> str:
-    """Return the digest of the file of an observer."""
-    try:
-        return sha256(Path(inspect.getsourcefile(find(reference)) or "").read_bytes()).hexdigest()
-    except (OSError, TypeError) as error:
-        raise CoopenvError(f"observer '{reference}': its source cannot be read ({error})") from None

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coopenv.base.errors import CoopenvError, listed
-from coopenv.base.installation import install_command
+from coopenv.base.installation import install_command, is_reference
 from coopenv.cli import options
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ def bench_observers(given: ObserverOptions) -> None:
         raise CoopenvError(f"--width {given.width.value}: is for files of figures, --figures pdf")
     printed, log = options.console(), options.console(stderr=True)
     executor = find_executor(given.engine, given.jobs, given.address, given.seconds, given.memory)
-    check_imports(executor, given.names or ())
+    check_imports(executor, [name for name in given.names or () if is_reference(name)])
     plan = given.plan()
     if given.basin:
         check_source(plan.source)
@@ -227,6 +227,8 @@ def bench_v1(
         for part in frozen.report(benchmark, result):
             printed.print(part, soft_wrap=isinstance(part, str), markup=False)
         printed.print(f"{out}: the result file", soft_wrap=True)
+    if result["refused"]:
+        raise CoopenvError("; ".join(result["refused"].values()))
     if lost := [total["observer"] for total in result["totals"] if total["failed"] == len(result["scenes"])]:
         raise CoopenvError(f"failed in every scene: {listed(lost)}")
 

@@ -36,6 +36,15 @@ class ObserverError(CoopenvError):
     """An observer raised an exception or returned an invalid estimate; the message names vehicle, time and reason."""
 
 
+def failure_text(error: BaseException) -> str:
+    """Return an exception of an observer in words, with its line where it is not one of this package."""
+    if isinstance(error, ObserverError):
+        return str(error)
+    last = extract_tb(error.__traceback__)[-1]
+    where = "" if isinstance(error, CoopenvError) else f" ({Path(last.filename).name}:{last.lineno})"
+    return f"{error_text(error)}{where}"
+
+
 class TimedEstimate(NamedTuple):
     """An estimate and its time, s (message included; a joint observer's time is divided by the vehicles)."""
 
@@ -171,9 +180,7 @@ class ObserverGroup:
         if isinstance(error, KeyboardInterrupt):
             raise error
         whose = "" if vehicle is None else f"at {self.observer_init.setups[vehicle].name} "
-        last = extract_tb(error.__traceback__)[-1]
-        where = "" if isinstance(error, CoopenvError) else f" ({Path(last.filename).name}:{last.lineno})"
-        return ObserverError(f"{whose}at {k * self.observer_init.dt:.3f} s: {error_text(error)}{where}")
+        return ObserverError(f"{whose}at {k * self.observer_init.dt:.3f} s: {failure_text(error)}")
 
     def get_state(self) -> dict[str, Any]:
         """Return a deep copy of the observers and of all messages, if they can be copied; empty before the start."""

@@ -30,7 +30,8 @@ def test_the_shipped_rows_are_of_the_shipped_scenes() -> None:
     assert len(scenes) == 30 and len([s for s in scenes if not s.source.policy.startswith("peek")]) == 20
     assert v1.zoo["comparable"] and v1.zoo["remarks"] == []
     assert {s.name: s.hash for s in scenes} == {name: scene["hash"] for name, scene in v1.zoo["scenes"].items()}
-    observers = {"robust", "split_covariance_intersection", "mekf_covariance", "riccati", "dead_reckoning"}
+    filters = {"robust", "schmidt_kalman", "split_covariance_intersection", "mekf_covariance"}
+    observers = filters | {"riccati", "dead_reckoning"}
     assert {(row["scene"], row["observer"]) for row in v1.zoo["rows"]} == {
         (s.name, o) for s in scenes for o in observers
     }
@@ -132,6 +133,35 @@ def test_totals_are_geometric_means_with_a_limit() -> None:
     assert (total["above"], total["failed"]) == (1, 1)
     [two] = totals_of([row("a", 0.1), row("b", 0.4)])
     assert two["rmse_m"] == pytest.approx(0.2) and two["rmse_se_m"] == pytest.approx(0.2 * 0.1 * math.sqrt(2) / 2)
+
+
+def test_rows_that_measurements_do_not_make_possible_are_refused() -> None:
+    """Below 0.9 of the bound and of all shipped rows, or with errors far too small for the stated covariance."""
+    benchmark = Frozen("v1")
+    shipped = [{**row, "observer": f"my_{row['observer']}"} for row in benchmark.zoo["rows"]]
+    assert benchmark.refused(benchmark.zoo["rows"]) == {}
+    assert {*benchmark.refused(shipped)} == {"my_riccati"}, "its matrix of gains is no covariance"
+    possible = row("lane", 0.026, bound_m=0.0277)
+    assert benchmark.refused([possible, row("ring", None, failure="at 1 s", bound_m=None)]) == {}
+    assert benchmark.refused([possible, row("ring", 1e-9, bound_m=0.05)]) == {
+        "mine": "mine refused: 1e-09 m in ring is below 0.045 m, 0.9 of the bound"
+    }
+    assert benchmark.refused([{**possible, "anees_median": 0.01}]) == {
+        "mine": "mine refused: ANEES 0.01 is below 0.16: state a smaller covariance, or none"
+    }
+
+
+def test_a_refused_row_is_one_line_and_stands_in_no_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    why = "Mine refused: 1e-09 m in lane is below 0.025 m, 0.9 of the bound"
+    scenes = Frozen("v1").zoo["scenes"]
+    result = {"rows": [], "refused": {"Mine": why}, "totals": [], "remarks": [why], "scenes": scenes}
+    monkeypatch.setattr(Frozen, "run", lambda *given: result)
+    monkeypatch.chdir(tmp_path)
+    assert main(["bench", "v1", "robust"]) == 2
+    printed = capsys.readouterr()
+    assert printed.err.endswith(f"error: {why}\n") and printed.out.count("Mine") == 1
 
 
 def test_an_observer_that_fails_alike_in_many_scenes_has_one_line() -> None:

@@ -29,6 +29,7 @@ from coopenv.estimation.observability import RecordedGeometry, analyse_observabi
 from coopenv.estimation.poses import Array
 from coopenv.observers.bound import Bound, cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Factory
+from coopenv.observers.isolation import started
 from coopenv.observers.recording import Recording, Truth
 from coopenv.observers.runner import PLANAR_STATES, Run, run
 
@@ -220,7 +221,7 @@ class Task:
     variant: str
     seed: int
     observers: Mapping[str, str | Factory]
-    """Observers by name, as `registry.find` accepts them in another process."""
+    """Observers by name, as `registry.find` accepts them in another process, or `Isolated` ones."""
     steady_from: float | None
     edges: tuple[float, ...] = ()
     """Edges of the windows that are judged one by one, s."""
@@ -242,9 +243,10 @@ class Task:
                 dof = len(PLANAR_STATES) if recording.on_a_plane else 6
                 yield failed_run(self.variant, name, scene, dof, ended[name], {})
             else:
-                result = run(factory, recording)
+                with started(factory) as observer:
+                    result = run(observer, recording)
+                    found = findings_on(observer, recording, result, scene.steady_from) if self.examined else ()
                 sample = sample_of(self.variant, name, scene, recording, result)
-                found = findings_on(factory, recording, result, scene.steady_from) if self.examined else ()
                 yield replace(sample, findings=found)
 
 
