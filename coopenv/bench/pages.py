@@ -67,7 +67,8 @@ def write_page_films(name: str, scenario: Scenario, folder: Path, on_progress: C
     """
     path, space = folder / f"{name}.webp", space_path(name, folder)
     policy, driver = driver_of(None, scenario, name, _SEED)
-    if not _moves(scenario, driver):
+    moving = any(each.motion.kind != "static" for each in (*scenario.vehicles, *scenario.landmarks))
+    if driver == _IDLE or not (driver or moving):
         path.unlink(missing_ok=True)
         return
     with closing(Engine(scenario)) as engine:
@@ -93,13 +94,6 @@ def _write_small(
             break
 
 
-def _moves(scenario: Scenario, driver: str) -> bool:
-    if driver:
-        return driver != _IDLE
-    moving = [vehicle.motion.kind for vehicle in scenario.vehicles] + [m.motion.kind for m in scenario.landmarks]
-    return any(kind != "static" for kind in moving)
-
-
 SETTINGS = ("ideal", "sensed", "blind")
 """Values of the key `sensing` of the scenario; all else is equal."""
 DRIVERS = ("route_follower", "peek")
@@ -109,19 +103,10 @@ TEAM_DRIVERS = ("look_ahead", "team_look_ahead")
 KEYS = ("sensing", "agent", "metric", "mean", "ci_low", "ci_high", "n")
 
 
-def has_value_of_sensing(name: str) -> bool:
-    """Return whether the value of sensing can be measured: both drivers were made for the environment."""
-    return {*DRIVERS} <= {*agents_for(name)}
-
-
-def has_value_of_cooperation(name: str) -> bool:
-    """Return whether the value of cooperation is measured in place of that of sensing."""
-    return {*TEAM_DRIVERS} <= {*agents_for(name)}
-
-
-def is_measured(name: str) -> bool:
-    """Return whether the page of an environment shows figures."""
-    return has_value_of_sensing(name) or has_value_of_cooperation(name)
+def measured_drivers(name: str) -> tuple[str, ...]:
+    """Return the drivers by which cooperation, or else sensing, is measured: if both were made for the environment."""
+    made = {*agents_for(name)}
+    return next((drivers for drivers in (TEAM_DRIVERS, DRIVERS) if {*drivers} <= made), ())
 
 
 def cooperation_settings(scenario: Scenario) -> dict[str, Mapping[str, Any]]:
@@ -134,7 +119,7 @@ def cooperation_settings(scenario: Scenario) -> dict[str, Mapping[str, Any]]:
 
 def studied(name: str, scenario: Scenario) -> tuple[tuple[str, ...], dict[str, Mapping[str, Any]]]:
     """Return the drivers that are measured, and the overrides of each setting that they are measured at."""
-    if has_value_of_cooperation(name):
+    if measured_drivers(name) == TEAM_DRIVERS:
         learned = [agent for agent in agents_for(name) if agent == f"{name}_team"]
         return (*TEAM_DRIVERS, *learned), cooperation_settings(scenario)
     shared = cooperation_settings(scenario) if sum(scenario.acting) > 1 else {}
@@ -207,7 +192,7 @@ def value_of_sensing_text(environment: str, scenario: Scenario, value: Mapping[s
     return rendered(
         "sensing.md.j2",
         environment=environment,
-        team=has_value_of_cooperation(environment),
+        team=measured_drivers(environment) == TEAM_DRIVERS,
         shared=any(how == "radio off" for how, _ in rows),
         drivers=studied(environment, scenario)[0],
         rows=rows,
@@ -255,7 +240,8 @@ def environment_page(name: str, scenario: Scenario, folder: Path) -> str:
     """Return the page of an environment, with the figures and the film that stand in the folder, if any do."""
     value = read_value_of_sensing(folder / f"{name}.json")
     measured = "" if value is None else value_of_sensing_text(name, scenario, value)
-    return page_text(name, scenario, measured, films(name, scenario, folder))
+    head = _head(name, scenario, films(name, scenario, folder))
+    return "\n\n".join([*head, *_scene(scenario), *_learning(scenario), *_end(name, measured)]) + "\n"
 
 
 def write_page(name: str, scenario: Scenario, folder: Path, on_film: Callable[[float], None] | None = None) -> None:
@@ -305,21 +291,6 @@ MOST_ROWS = 40
 """Most rows of a table of vehicles, routes, landmarks or buildings."""
 SHOWN_ELSEWHERE = {"observation.include", "observation.scales", "observation.centers", "reward.privileged"}
 """Settings that other tables show, as they show the weights."""
-
-
-def page_text(name: str, scenario: Scenario, measured: str = "", films: Iterable[str] = ()) -> str:
-    """Return the page of an environment.
-
-    Args:
-        name: of the environment and of the picture beside the page.
-        scenario: the environment.
-        measured: a part with measured figures, if there are any.
-        films: paragraphs of the films beside the page.
-    """
-    return (
-        "\n\n".join([*_head(name, scenario, films), *_scene(scenario), *_learning(scenario), *_end(name, measured)])
-        + "\n"
-    )
 
 
 def _head(name: str, scenario: Scenario, films: Iterable[str]) -> Iterator[str]:

@@ -196,7 +196,7 @@ def page(
     if len(stems) < len(names):
         raise CoopenvError("two environments have the same name")
     scenarios = {name: options.load(text, {}) for name, text in stems.items()}
-    measured = [name for name in stems if measure and (pages.is_measured(name) or not everything)]
+    measured = [name for name in stems if measure and (pages.measured_drivers(name) or not everything)]
     for name in measured:
         pages.contests(stems[name], scenarios[name], worlds)
     pages.prepare(out, list(stems))

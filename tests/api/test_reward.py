@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 import coopenv
 from coopenv.api.arguments import FIELDS, OTHERS, Step, check_function
 from coopenv.base.errors import CoopenvError
-from coopenv.bench.pages import has_value_of_sensing
+from coopenv.bench.pages import DRIVERS, measured_drivers
 from coopenv.policies import load_agent
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.policies.scripted import Peek
@@ -165,7 +165,7 @@ def test_what_is_no_function_is_refused_and_a_gpu_has_no_arrays_for_one() -> Non
 ENVIRONMENTS = [
     name
     for name, s in SHIPPED.items()
-    if s.driven and s.backend == "simulated" and s.observer.name == "robust" and has_value_of_sensing(name)
+    if s.driven and s.backend == "simulated" and s.observer.name == "robust" and measured_drivers(name) == DRIVERS
 ]
 """Not the laboratory's experiments: hardly anything varies in them, which are there to be driven by cars."""
 EXCEPTIONS = {

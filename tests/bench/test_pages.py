@@ -19,7 +19,7 @@ from coopenv.bench.pages import (
     environment_page,
     fingerprint,
     index_text,
-    is_measured,
+    measured_drivers,
     studied,
     value_of_sensing_text,
 )
@@ -52,7 +52,7 @@ def small(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("name", list_envs())
 def test_the_page_of_every_environment_is_up_to_date(name: str) -> None:
-    page, measure = PAGES / f"{name}.md", " --measure" if is_measured(name) else ""
+    page, measure = PAGES / f"{name}.md", " --measure" if measured_drivers(name) else ""
     again = f"run: coopenv page {name} --out docs/environments"
     assert page.is_file(), again + measure
     assert page.read_text(encoding="utf-8") == environment_page(name, load_scenario(name), PAGES), again
