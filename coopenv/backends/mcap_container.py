@@ -186,6 +186,11 @@ class Container:
         metadata = {record.name: record.metadata for record in records if isinstance(record, Metadata)}
         return metadata, {record.name: record.data for record in records if isinstance(record, Attachment)}
 
+    def topics(self) -> list[str]:
+        """Return the names of all topics, sorted; errors as in `messages`."""
+        described = messages_of(self._records(Allowance(len(self._data))))
+        return sorted({channel.topic for channel, _, message in described if message is None})
+
     def messages(self) -> Iterator[tuple[Channel, Schema | None, Message]]:
         """Yield all messages in the order of the file, with their channels and the schemas of those.
 

@@ -314,12 +314,18 @@ def export(
 
 
 def _export_layout(log: Path, out: Path) -> None:
-    from coopenv.backends.mcap_format import topics_of
+    from coopenv.backends.mcap_format import codec, reading
     from coopenv.base.errors import DataError
     from coopenv.base.files import replace_text
     from coopenv.viz.foxglove import layout_text
 
-    topics = topics_of(log)
+    codec()
+    from coopenv.backends.mcap_container import Container
+
+    if log.is_dir():
+        raise DataError(f"{log}: a folder; expected a log file (.mcap)")
+    with reading(str(log)):
+        topics = Container(log).topics()
     if "/scene/world" not in topics:
         raise DataError(f"{log}: has no scene, `coopenv record --scene` writes one")
     replace_text(out, layout_text(topics))
