@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields
 from enum import Enum, StrEnum
 from functools import partial
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import typer
@@ -54,24 +55,19 @@ def completion(names: Callable[[], Iterable[str]], several: bool = False) -> Cal
     return complete
 
 
-def _observer_names() -> list[str]:
-    from coopenv.observers.registry import list_observers
-
-    return list_observers()
-
-
-def _override_keys() -> Iterator[str]:
-    """Yield the dotted keys of a scenario, each with its `=`."""
-    from coopenv.scenario import Scenario
-
-    return (f"{key}=" for key in dotted_keys(Scenario))
+def late(place: str) -> Callable[..., Any]:
+    """Return a function, `module:name`, whose module is loaded by the first call."""
+    return lambda *arguments: resolve_name(place)(*arguments)
 
 
+observer_names = late("coopenv.observers.registry:list_observers")
+check_agent = late("coopenv.policies.loader:check_agent")
+check_observer = late("coopenv.observers.registry:check_known")
 environments = completion(lambda: [*list_envs(), *(f"{kind}:" for kind in SCENES)])  # the shell completes files itself
 agents, agent_lists = completion(list_agents), completion(list_agents, several=True)
 policies, policy_lists = (completion(lambda: [*PLAIN, *list_agents()], several) for several in (False, True))
-observers = completion(_observer_names, several=True)
-override_keys = completion(_override_keys)
+observers = completion(observer_names, several=True)
+override_keys = completion(lambda: (f"{key}=" for key in dotted_keys(resolve_name("coopenv.scenario:Scenario"))))
 
 
 def existing(what: str) -> Callable[[Any], Any]:
@@ -93,7 +89,7 @@ def known_environment(name: str | None) -> str | None:
     if name is not None and name.endswith((*BAG_SUFFIXES, LOG_SUFFIX)):
         existing("log" if name.endswith(LOG_SUFFIX) else "bag")(name)
     if name is not None and not (os.path.exists(name) or is_scene(name) or is_recorded(name)):  # noqa: PTH110 (never raises)
-        for kind, names in (("agent", list_agents()), ("observer", _observer_names())):
+        for kind, names in (("agent", list_agents()), ("observer", observer_names())):
             if name in names:
                 raise CoopenvError(f"expected an environment, {name} is an {kind}: coopenv list, coopenv list {kind}s")
         scenario_path(name)
@@ -108,22 +104,8 @@ def known_source(name: str) -> str | None:
 def known_policy(name: str | None) -> str | None:
     """Return the name of a policy, a folder or a place in code. Raises CoopenvError: there is no such policy."""
     if name is not None and name not in PLAIN:
-        from coopenv.policies.loader import check_agent
-
         check_agent(name, "policy", PLAIN)
     return name
-
-
-def _check_agent(name: str) -> None:
-    from coopenv.policies.loader import check_agent
-
-    check_agent(name)
-
-
-def _check_observer(name: str) -> None:
-    from coopenv.observers.registry import check_known
-
-    check_known(name)
 
 
 def each(check: Callable[[str], object]) -> Callable[[Any], Any]:
@@ -137,7 +119,7 @@ def each(check: Callable[[str], object]) -> Callable[[Any], Any]:
     return checked
 
 
-known_environments, known_agents = each(known_environment), each(_check_agent)
+known_environments, known_agents = each(known_environment), each(check_agent)
 
 
 def words(text: str | None) -> list[str]:
@@ -150,7 +132,7 @@ POLICY: dict[str, Any] = {"autocompletion": policies, "callback": known_policy}
 POLICIES: dict[str, Any] = {"autocompletion": policy_lists, "callback": each(known_policy)}
 AGENT: dict[str, Any] = {"autocompletion": agents, "callback": known_agents}
 AGENTS: dict[str, Any] = {"autocompletion": agent_lists, "callback": known_agents}
-OBSERVERS: dict[str, Any] = {"autocompletion": observers, "callback": each(_check_observer)}
+OBSERVERS: dict[str, Any] = {"autocompletion": observers, "callback": each(check_observer)}
 """Completion and check of an argument or option."""
 
 
