@@ -64,7 +64,11 @@ def topology_figure(trajectory: Trajectory, ends: Sequence[float] | None = None,
     """
     count = len(trajectory.vehicles)
     live = live_ticks(trajectory.t, count, ends)
-    lanes = [_changing(trajectory, vehicle, ticks) for vehicle, ticks in enumerate(live)]
+    lanes = []
+    for vehicle, ticks in enumerate(live):
+        sight = trajectory.sight[:ticks, vehicle]
+        changing = np.any(sight != sight[:1], axis=0)
+        lanes.append(np.flatnonzero(np.any(sight != Sight.NOT_A_NEIGHBOUR, axis=0) & changing))
     rows = [max(_EMPTY, len(targets)) * _LANE + _TITLE for targets in lanes]
     figure, inches = house.canvas(width, _FRAME + sum(rows))
     axes = figure.subplots(count, 1, squeeze=False, height_ratios=[max(_EMPTY, len(lane)) for lane in lanes])[:, 0]
@@ -84,12 +88,6 @@ def topology_figure(trajectory: Trajectory, ends: Sequence[float] | None = None,
     if handles:
         house.legend_above(figure, handles)
     return figure
-
-
-def _changing(trajectory: Trajectory, vehicle: int, ticks: int) -> np.ndarray:
-    """Return the neighbours of a vehicle that are not the same all the time."""
-    sight = trajectory.sight[:ticks, vehicle]
-    return np.flatnonzero(np.any(sight != Sight.NOT_A_NEIGHBOUR, axis=0) & np.any(sight != sight[:1], axis=0))
 
 
 def _draw_lanes(ax: Axes, trajectory: Trajectory, vehicle: int, targets: np.ndarray, ticks: int) -> bool:

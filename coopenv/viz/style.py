@@ -264,24 +264,14 @@ def mark_look(marker: str, edge: str, face: str, size: float = 6.0, rim: float =
 
 def legend_above(figure: Figure, handles: Sequence[Artist]) -> None:
     """Put a legend above the panels, in as many columns as fit."""
-    lengths = [_LEGEND_MARK + _LEGEND_LETTER * shown_length(str(handle.get_label())) for handle in handles]
-    width = float(figure.get_figwidth())
-    columns = next(n for n in range(len(handles), 0, -1) if n == 1 or _columns_width(lengths, n) <= width)
+    labels = [re.sub(r"[${}_^\\]", "", str(handle.get_label())) for handle in handles]  # formulas by their letters
+    lengths, columns = np.array([_LEGEND_MARK + _LEGEND_LETTER * len(label) for label in labels]), len(handles)
+    while columns > 1 and sum(max(part) for part in np.array_split(lengths, columns)) > figure.get_figwidth():
+        columns -= 1
     _grow(figure, -(-len(handles) // columns) - 1)
     spacing: dict[str, Any] = {"handlelength": 2.2, "columnspacing": 1.6}
     place = "upper center" if figure.get_layout_engine() is None else "outside upper center"
     legend(figure, handles, place, ncols=columns, fontsize=SMALL + 0.5, **spacing)
-
-
-def shown_length(text: str) -> int:
-    """Return the number of visible characters of a text, its formulas counted by their letters."""
-    return len(re.sub(r"[${}_^\\]", "", text))
-
-
-def _columns_width(lengths: Sequence[float], columns: int) -> float:
-    """Return the widths of columns of entries; the first columns may hold one entry more."""
-    rows = np.array_split(np.array(lengths), columns)
-    return float(sum(column.max(initial=0.0) for column in rows))
 
 
 def show_decades(ax: Axes) -> None:

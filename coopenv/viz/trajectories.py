@@ -171,8 +171,9 @@ def trajectory_figure_3d(
     ax: Any = figure.add_subplot(projection="3d")
     ax.view_init(elev=32, azim=-58)
     drawing = Drawing(ax, low, high, dimensions=3)
-    if scenario is not None:
-        _draw_buildings(ax, scenario, low, high)
+    for box in [] if scenario is None else Stage(scenario).buildings:
+        *sides, _, top = np.clip(box.faces, low, high)
+        ax.add_collection3d(Poly3DCollection([*sides, top], facecolor=ROOF, edgecolor=WALL, linewidth=0.6, alpha=0.35))
     handles = _draw_paths(drawing, trajectory, ends, scenario)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     ax.set_box_aspect(high - low, zoom=float(np.clip((1.45 if inches > style.NARROW else 1.2) - 0.5 * steep, 0.7, 1.4)))
@@ -190,14 +191,6 @@ def trajectory_figure_3d(
     ax.set_position((0.0, 0.1 / whole, 1.0, (height - _LEGEND) / whole))
     drawing.write_names()
     return figure
-
-
-def _draw_buildings(ax: Any, scenario: Scenario, low: np.ndarray, high: np.ndarray) -> None:
-    """Draw the buildings, as far as they are in the box."""
-    for box in Stage(scenario).buildings:
-        *sides, _, top = np.clip(box.faces, low, high)
-        faces = Poly3DCollection([*sides, top], facecolor=ROOF, edgecolor=WALL, linewidth=0.6, alpha=0.35)
-        ax.add_collection3d(faces)
 
 
 def _scene(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
@@ -284,19 +277,14 @@ def _draw_estimate(drawing: Drawing, estimate: np.ndarray, early: np.ndarray, ve
     rest = estimate[last:]
     if len(rest):
         drawing.line(rest, color=colour, **_FAINT)
-        drawing.line(_median_path(rest), color=colour, **_ESTIMATE)
+        ticks = np.arange(len(rest), dtype=float)  # medians hide less of the truth than the noise would
+        middle = np.stack([style.summed_up(ticks, column, _STRETCHES)[1] for column in rest.T], axis=-1)
+        drawing.line(np.concatenate([rest[:1], middle, rest[-1:]]), color=colour, **_ESTIMATE)
     if np.isfinite(estimate[0]).all():
         drawing.outside |= not inside[0]
         drawing.mark(np.clip(estimate[0], low, high), "^", colour, None if inside[0] else "white")
     if inside[-1]:
         drawing.mark(estimate[-1], "x", colour)
-
-
-def _median_path(path: np.ndarray) -> np.ndarray:
-    """Return a path (K, 3) through medians over short stretches, which hides less of the truth than its noise would."""
-    ticks = np.arange(len(path), dtype=float)
-    middle = np.stack([style.summed_up(ticks, column, _STRETCHES)[1] for column in path.T], axis=-1)
-    return np.concatenate([path[:1], middle, path[-1:]])
 
 
 def _round_step(duration: float) -> float:
