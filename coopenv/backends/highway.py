@@ -20,13 +20,6 @@ BEND = 2.0  # m, length of a strip of a lane that bends
 MARGIN = 25.0  # m, of road that is drawn beyond the outermost landmark
 
 
-def drawn_roads(network: Any, scenario: Scenario) -> tuple[Road, ...]:
-    """Return strips of all lanes as far as the landmarks stand, y up, in the coordinates of the scenario's file."""
-    places = [landmark.position[:2] for landmark in scenario.landmarks] or [(0.0, 0.0)]
-    reach = float(np.abs(places).max()) + MARGIN
-    return tuple(road for lane in network.lanes_list() for road in _strips(lane, reach))
-
-
 def _strips(lane: Any, reach: float) -> list[Road]:
     s = np.linspace(0.0, lane.length, max(2, int(np.ceil(lane.length / BEND)) + 1))
     middle = np.array([lane.position(x, 0.0) for x in s]) * (1.0, -1.0)
@@ -194,8 +187,11 @@ class Simulation(TrafficProgram):
 
     @property
     def roads(self) -> tuple[Road, ...]:
-        """Lanes of its road network."""
-        return drawn_roads(self.environment.road.network, self._scenario)
+        """Lanes of its road network as far as the landmarks stand, y up, in the coordinates of the scenario's file."""
+        places = [landmark.position[:2] for landmark in self._scenario.landmarks] or [(0.0, 0.0)]
+        reach = float(np.abs(places).max()) + MARGIN
+        lanes = self.environment.road.network.lanes_list()
+        return tuple(road for lane in lanes for road in _strips(lane, reach))
 
     def reset(self, seed: int) -> None:
         """Draw traffic and starts; of the traffic, the cars nearest to the first driven one are connected.

@@ -42,7 +42,4 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
             return f" (in the shell: {package} {name})"
         return suggest(name, module.__all__) or f"; known: {listed(module.__all__, 40)}"
 
-    def public_names() -> list[str]:
-        return sorted(module.__all__)
-
-    return get, public_names
+    return get, lambda: sorted(module.__all__)
