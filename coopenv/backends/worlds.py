@@ -131,6 +131,8 @@ class Simulated(TickGenerator):
 CHANGEABLE = ("action", "description", "horizon", "observation", "observer", "reward", "termination", "title")
 """Keys of the use of a recording; the others describe its origin."""
 
+LASTING = ("odometry_scale", "odometry_scale_walk", "gyro_bias", "gyro_bias_walk")  # errors of a vehicle's odometry
+
 DECISION_RATE = 10.0  # Hz, of the replay of robots, or the next rate at which decisions fall on ticks
 
 
@@ -210,13 +212,8 @@ def _of_robots(recording: Recording, name: str) -> dict[str, Any]:
             "decision": rate / max(1, round(rate / DECISION_RATE)),
         },
         "noise": {
-            "velocity": noise.velocity,
-            "angular_velocity": noise.angular_velocity,
+            **{name: getattr(noise, name) for name in ("velocity", "angular_velocity", *LASTING)},
             "bearing": {"model": "isotropic", "scale": noise.bearing},
-            "odometry_scale": noise.odometry_scale,
-            "odometry_scale_walk": noise.odometry_scale_walk,
-            "gyro_bias": noise.gyro_bias,
-            "gyro_bias_walk": noise.gyro_bias_walk,
             "slip": dict(zip(("rate", "duration", "size", "angle"), noise.slip, strict=True)),
         },
         "topology": {"mode": "sensed", "acyclic": False},

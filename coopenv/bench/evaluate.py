@@ -37,7 +37,6 @@ from coopenv.viz.style import INK, NORMAL, SMALL
 from coopenv.viz.topview import TopView
 
 JSON_FILE = "evaluation.json"
-FILMS = ("video.mp4", "video.gif")
 
 
 def document(evaluation: Evaluation, command: str) -> dict[str, Any]:
@@ -98,7 +97,7 @@ def run(
     if out is None:
         return driven()
     check_new(out / JSON_FILE, force)
-    names = [JSON_FILE, *(f"{name}.{form}" for name in KINDS for form in FORMATS), *FILMS, REPLAY_FILE]
+    names = [JSON_FILE, *(f"{name}.{form}" for name in KINDS for form in FORMATS), *films.VIDEO_FILES, REPLAY_FILE]
     with replacing_folder(out, [*names, *(path.name for path in out.glob("replay_*.html"))]) as new:
         evaluation = driven()
         replace_text(new / JSON_FILE, json_text(document(evaluation, command)))

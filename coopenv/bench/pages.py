@@ -67,8 +67,8 @@ def write_page_films(name: str, scenario: Scenario, folder: Path, on_progress: C
     """
     path, space = folder / f"{name}.webp", space_path(name, folder)
     policy, driver = driver_of(None, scenario, name, _SEED)
-    moving = any(each.motion.kind != "static" for each in (*scenario.vehicles, *scenario.landmarks))
-    if driver == _IDLE or not (driver or moving):
+    kinds = [vehicle.motion.kind for vehicle in scenario.vehicles] + [mark.motion.kind for mark in scenario.landmarks]
+    if driver == _IDLE or not (driver or {*kinds} - {"static"}):
         path.unlink(missing_ok=True)
         return
     with closing(Engine(scenario)) as engine:

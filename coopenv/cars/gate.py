@@ -20,7 +20,7 @@ import math
 import secrets
 import struct
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -138,15 +138,6 @@ def read_drive(payload: bytes, message: CommandMessage) -> MotionCommand:
     kinds = [KINDS[kind] for kind, _ in message.neutral.values()]
     _, _, *values = read(payload, (STAMP, TEXT, *kinds))
     return message.drive(dict(zip(message.neutral, values, strict=True)))
-
-
-def write_status(
-    stamp: int, session: str, nonce: str, state: str, accepted: int, last_sequence: int, rejections: Mapping[str, int]
-) -> bytes:
-    """Return a coopenv_msgs/GateStatus; rejections are counts by reason."""
-    return write(
-        STATUS, stamp, "", session, nonce, state, accepted, last_sequence, [*rejections], [*rejections.values()]
-    )
 
 
 class GateMode(StrEnum):
@@ -293,8 +284,8 @@ class Gate:
         """Return the GateStatus now."""
         state = self.state
         session = self._session if state in (GateMode.ARMED, GateMode.TIMED_OUT) else ""
-        last, counts = max(self._sequence, 0), {str(reason): count for reason, count in self._counts.items()}
-        return write_status(self._clock.wall(), session, self.nonce, state, self._accepted, last, counts)
+        about, counted = (self._clock.wall(), "", session, self.nonce, state), (self._accepted, max(self._sequence, 0))
+        return write(STATUS, *about, *counted, [*self._counts], [*self._counts.values()])
 
     def _command(self, payload: bytes, attachment: bytes) -> None:
         stamp, frame, *numbers = read(payload, COMMAND)

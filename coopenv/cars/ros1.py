@@ -234,19 +234,14 @@ def join(address: Address, timeout: float) -> Master:
         if _master is None:
             os.environ["ROS_MASTER_URI"] = master.uri
             if not {"ROS_IP", "ROS_HOSTNAME"} & set(os.environ):
-                os.environ["ROS_IP"] = _own_address(address)  # else rospy chooses any address
+                with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:  # else rospy chooses any address
+                    probe.connect((address.host, address.port))  # nothing is sent
+                    os.environ["ROS_IP"] = str(probe.getsockname()[0])  # of this computer as the master sees it
             options = {"disable_signals": True, "disable_rostime": True, "disable_rosout": True}
             library.init_node("coopenv", argv=[], anonymous=True, **options)
             atexit.register(library.signal_shutdown, "the process ends")
             _master = master.uri
     return master
-
-
-def _own_address(master: Address) -> str:
-    """Return the address of this computer as the master sees it; nothing is sent."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.connect((master.host, master.port))
-        return str(probe.getsockname()[0])
 
 
 @cache

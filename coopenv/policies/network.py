@@ -5,8 +5,8 @@ import math
 import warnings
 from collections.abc import Mapping
 from hashlib import sha256
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
@@ -89,11 +89,9 @@ class Network:
             raise CoopenvError(f"{folder / 'agent.toml'}: network.layout is not the hash of its tables")
         self._clip = np.float32(network.clip)
         tensors = load_weights(path, network.sha256)
-        _check_names(path, tensors)
-        self._mean, self._std = tensors.pop("observation.mean"), tensors.pop("observation.std")
-        depth = len([name for name in tensors if name.endswith(".weight")])
+        depth = _depth_of(path, tensors, len(self._columns), len(action))
+        self._mean, self._std = tensors["observation.mean"], tensors["observation.std"]
         self._layers = [(tensors[f"layers.{i}.weight"].T.copy(), tensors[f"layers.{i}.bias"]) for i in range(depth)]
-        _check_shapes(path, len(self._columns), len(action), self._mean, self._std, self._layers)
         self._name, self._seen, self._rows = folder.resolve().name, dict(network.seen), 0
         self._places = {name: slice(observation[name].start, observation[name].stop) for name in self._seen}
         self._outside = dict.fromkeys(self._seen, 0.0)
@@ -160,18 +158,18 @@ def load_weights(path: Path, digest: str) -> dict[str, np.ndarray]:
     return tensors
 
 
-def _check_names(path: Path, tensors: Mapping[str, np.ndarray]) -> None:
+def _depth_of(path: Path, tensors: Mapping[str, np.ndarray], inputs: int, outputs: int) -> int:
+    """Return the number of layers. Raises CoopenvError: the weights are not those of a policy of such a width."""
     names = {"observation.mean", "observation.std", "log_std"}
     depth = (len(tensors) - len(names)) // 2
     expected = names | {f"layers.{i}.{part}" for i in range(depth) for part in ("weight", "bias")}
     if set(tensors) != expected or depth < 1:
         raise CoopenvError(f"{path}: not the weights of a policy: {', '.join(sorted(set(tensors) ^ expected))[:80]}")
-
-
-def _check_shapes(path: Path, inputs: int, outputs: int, mean: Any, std: Any, layers: list[Any]) -> None:
-    widths = [inputs, *(weight.shape[-1] for weight, _ in layers)]
-    fits = mean.shape == std.shape == (inputs,) and widths[-1] == outputs and bool((std > 0).all())
-    for (weight, bias), before, after in zip(layers, widths[:-1], widths[1:], strict=True):
-        fits = fits and weight.shape == (before, after) and bias.shape == (after,)
-    if not fits:
+    widths = [inputs, *(tensors[f"layers.{i}.bias"].size for i in range(depth - 1)), outputs]
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("observation.mean", "observation.std"), (inputs,))
+    for i, (before, after) in enumerate(pairwise(widths)):
+        shapes |= {f"layers.{i}.weight": (after, before), f"layers.{i}.bias": (after,)}
+    fits = all(tensors[name].shape == shape for name, shape in shapes.items())
+    if not fits or not (tensors["observation.std"] > 0).all():
         raise CoopenvError(f"{path}: shapes do not fit {inputs} observations and {outputs} entries of an action")
+    return depth

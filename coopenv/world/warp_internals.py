@@ -53,15 +53,12 @@ class _ByReference(wp.Function):
         """Return the overload for types of arguments, see `wp.Function`."""
         overload: Any = super().get_overload(arg_types, kwarg_types)
         if overload is not None:
-            types = {name: _as_handed(kind) for name, kind in overload.input_types.items()}
+            given = overload.input_types.items()
+            types = {name: _REFERENCE[kind] if _has_arrays(kind) else kind for name, kind in given}
             if types != overload.input_types:
                 overload.input_types = types
                 overload.adj = type(overload.adj)(overload.func, types, source=overload.adj.source)
         return overload
-
-
-def _as_handed(kind: Any) -> Any:
-    return _REFERENCE[kind] if _has_arrays(kind) else kind
 
 
 def _has_arrays(kind: Any) -> bool:

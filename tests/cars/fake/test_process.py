@@ -28,7 +28,7 @@ from coopenv.cars.deployment import DeploymentError, Safety, load_deployment
 from coopenv.cars.fake.fleet import FakesError, free_port
 from coopenv.cars.fake.fleet import fakes as fake_processes
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.gate import write_status
+from coopenv.cars.gate import STATUS, write
 from coopenv.cars.keys import load_signer, load_verifier, make_keys
 from coopenv.cars.profile import SVEA, Limits, Role, presence_of
 from coopenv.cars.transport import Arrival
@@ -168,13 +168,13 @@ def test_health_takes_no_status_that_the_car_has_not_signed(tmp_path: Path) -> N
     make_keys(tmp_path / "keys", ["svea7", "svea8", "station"])
     endpoint, file = free_endpoint(), tmp_path / "fleet.toml"
     file.write_text(SHIPPED.read_text() + '\n[security]\nkeys = "keys"\n')
-    ended, topic = Event(), SVEA.topic_of("svea7", Role.GATE)
+    ended, topic, texts = Event(), SVEA.topic_of("svea7", Role.GATE), ("", "", "n")
     with closing(open_zenoh("router", listen=[endpoint])) as forger:
 
         def forge() -> None:
             while not ended.wait(0.05):
-                forger.publish(topic, write_status(time.time_ns(), "", "n", "disarmed", 0, 0, {"foreign": 0}))
-                forger.publish(topic, write_status(time.time_ns(), "", "n", "\x1b[2Jdisarmed", 0, 0, {}))
+                forger.publish(topic, write(STATUS, time.time_ns(), *texts, "disarmed", 0, 0, ["foreign"], [0]))
+                forger.publish(topic, write(STATUS, time.time_ns(), *texts, "\x1b[2Jdisarmed", 0, 0, [], []))
 
         with ThreadPoolExecutor(1) as pool:
             forging = pool.submit(forge)

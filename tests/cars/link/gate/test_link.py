@@ -22,6 +22,7 @@ from coopenv.cars.gate import (
     ARM,
     BOOL,
     COMMAND,
+    STATUS,
     Gate,
     GateMode,
     Malformed,
@@ -29,7 +30,6 @@ from coopenv.cars.gate import (
     read,
     write,
     write_drive,
-    write_status,
 )
 from coopenv.cars.gate_process import GateConnection, run
 from coopenv.cars.profile import NEUTRAL, SVEA, MotionCommand, Role
@@ -200,7 +200,8 @@ def test_manual_control_is_that_of_rosbags(stamp: int, numbers: list[float], but
 def test_the_status_is_that_of_rosbags(
     stamp: int, session: str, nonce: str, state: str, accepted: int, last: int, counts: dict[str, int]
 ) -> None:
-    payload = write_status(stamp, session, nonce, state, accepted, last, counts)
+    lists = [*counts], [*counts.values()]
+    payload = write(STATUS, stamp, "", session, nonce, state, accepted, last, *lists)
     fields: dict[str, Any] = {"session": session, "nonce": nonce, "state": state}
     fields |= {"accepted": accepted, "last_sequence": last}
     fields |= {"rejections": list(counts), "counts": np.array(list(counts.values()), dtype=np.uint64)}
