@@ -206,10 +206,6 @@ def record(given: RecordOptions) -> None:
             raise CoopenvError(f"--override: is for a simulation, {environment} is recorded")
         recording = open_recording(environment, given.data, given.variant, given.selection)
     else:
-        chosen = {"data": given.data, "variant": given.variant, **given.selection.given}
-        for option, value in () if bag else ((f"--{name}", value) for name, value in chosen.items()):
-            if value is not None:
-                raise CoopenvError(f"{option} {value}: is for recorded data, {environment} is simulated")
         backend = given.open()
         with Progress(log, "recording", total=1.0) as progress:
             recording = recorded(backend, given.seed, given.policy, progress.update, keep)
