@@ -33,6 +33,7 @@ from coopenv.backends.mcap_format import (
 from coopenv.base.errors import DataError, OutputError, check_memory, shown
 from coopenv.base.files import check_file, replacing_file
 from coopenv.base.installation import version
+from coopenv.base.sections import validated
 from coopenv.observers.arrays import ARRAYS, sizes_of
 from coopenv.observers.contract import Setup
 from coopenv.observers.recording import Recording, Truth, check_recording
@@ -165,7 +166,7 @@ def _header(container: Container, where: str) -> RecordingHeader:
         raise DataError(f"{where}: attachment '{ATTACHMENT}' is missing")
     if hashlib.sha256(attachments[ATTACHMENT]).hexdigest() != found.get("sha256"):
         raise DataError(f"{where}: {ATTACHMENT} is damaged, its check sum differs")
-    return RecordingHeader.read(attachments[ATTACHMENT], f"{where}: {ATTACHMENT}")
+    return validated(RecordingHeader, attachments[ATTACHMENT], f"{where}: {ATTACHMENT}", DataError)
 
 
 def write_recording(recording: Recording, path: str | Path, *, views: Sequence[View] = (), start: float = 0.0) -> None:

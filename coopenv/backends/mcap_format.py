@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, create_model
@@ -21,7 +21,7 @@ from pydantic import Field, create_model
 from coopenv.base.errors import CoopenvError, DataError, regular
 from coopenv.base.format import jsonable
 from coopenv.base.installation import install_command, message_types, needing, version
-from coopenv.base.sections import Number, Section, Vector3, validated
+from coopenv.base.sections import Number, Section, Vector3
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Drawn, Recording
 from coopenv.scenario import parse_scenario
@@ -118,11 +118,6 @@ class RecordingHeader(Section):
     start_covariance: tuple[Matrix6, ...]
     scenario: dict[str, Any] | None
     drawn: _section_of(Drawn) | None = None  # type: ignore[valid-type]
-
-    @classmethod
-    def read(cls, text: bytes, where: str) -> Self:
-        """Return a header from its JSON. Raises DataError: it is no header; `where` begins the line."""
-        return validated(cls, text, where, DataError)
 
     def constants(self, where: str) -> dict[str, Any]:
         """Return the arguments of a `Recording` that the header gives; a ScenarioError if its scenario is none."""

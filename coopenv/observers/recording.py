@@ -298,11 +298,10 @@ class Recording(Measurements):
 
     def at(self, k: int) -> Sensed:
         """Return the measurements of all vehicles at tick k."""
-        sensed: dict[str, Any] = {name: getattr(self, name)[k] for name in PER_TICK}
+        sensed = {name: getattr(self, name)[k] for name in PER_TICK}
         truth = Truth(self.truth.rotation[k], self.truth.position[k])
-        if self.pan is not None:
-            sensed["pan"] = self.pan[k]
-        return Sensed(index=k, dt=self.dt, due=bool(self.due[k]), truth=truth, **sensed)
+        pan = None if self.pan is None else self.pan[k]
+        return Sensed(index=k, dt=self.dt, due=bool(self.due[k]), pan=pan, truth=truth, **sensed)
 
     def odometry_age(self, rate: float) -> Array:
         """Return (K,) the age of the last odometry sample at each tick, s; samples are taken at 0, 1 / rate, ... s."""
