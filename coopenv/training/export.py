@@ -56,6 +56,7 @@ def export(
     """
     write_settings(folder, old, trainer.plan, environment)
     tensors = trainer.tensors if isinstance(trainer, SetTrainer) else trainer.tensors()
+    tensors = {name: np.asarray(values, dtype=np.float32) for name, values in tensors.items()}
     weights = save(tensors)
     with writing(folder):
         (folder / WEIGHTS_FILE).write_bytes(weights)

@@ -132,8 +132,8 @@ class Settings(Section):
     start: str | None = None
     """Learned agent that the training continues, name or folder, with its critic and normalisation."""
     right_of_way: bool = False
-    """Limit the speeds to those at which the driver `look_ahead` gives way, and follow its plan where a vehicle stands in
-    the way or the route is too far away."""
+    """Limit the speeds to those at which the driver `look_ahead` gives way, and follow its plans where a vehicle stands
+    in the way or the route is too far away."""
     scenario: dict[str, Any] = Field(default={})
     """Overrides of the scenario, as tables or dotted keys, as with `--override`."""
     randomised: dict[str, Any] = Field(default={})

@@ -494,11 +494,11 @@ class Trainer:
         return min(1.0, self.model.num_timesteps / steps) if steps else 1.0
 
     def tensors(self) -> Arrays:
-        """Return a copy of networks and normalisation, float32, by the names of an agent's weights."""
+        """Return a copy of networks and normalisation by the names of an agent's weights."""
         env, found = self.env, {name: values.detach().numpy() for name, values in self._parameters().items()}
         found |= {"observation.mean": env.statistics.mean, "observation.std": env.std}
         found[COUNTS] = np.array([env.statistics.count, env.spread.mean, env.spread.var, env.spread.count])
-        return {name: np.array(values, dtype=np.float32) for name, values in found.items()}
+        return {name: np.array(values) for name, values in found.items()}
 
     @torch.no_grad()
     def take(self, tensors: Arrays) -> None:

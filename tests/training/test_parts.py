@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("stable_baselines3", reason="needs the extra 'train'")
 
 import torch
+from safetensors.numpy import load_file
 
 import coopenv
 from coopenv.api.engine import Engine
@@ -52,7 +53,7 @@ def test_numpy_and_onnx_agree_with_torch(trained: Trainer, tmp_path: Path) -> No
     assert isinstance(agent, Network)
     assert agent(observations) == pytest.approx(expected, abs=1e-5)
     reference = pytest.importorskip("onnx.reference", reason="needs the extra 'onnx'")
-    data = onnx_model(trained.tensors(), trained.plan.settings.ppo.observation_clip)
+    data = onnx_model(load_file(tmp_path / "weights.safetensors"), trained.plan.settings.ppo.observation_clip)
     (tmp_path / "policy.onnx").write_bytes(data)
     model = reference.ReferenceEvaluator(str(tmp_path / "policy.onnx"))
     assert model.run(None, {"observation": observations})[0] == pytest.approx(expected, abs=1e-5)
