@@ -68,7 +68,7 @@ class Watch(BaseCallback):
         super().__init__()
         self._env = env
         self._errors: list[np.ndarray] = []
-        self._begun = np.zeros(env.num_envs, dtype=bool)
+        self._begun, self._whole = np.zeros(env.num_envs, dtype=bool), False
         self._last: dict[int, dict[str, Any]] = {}
 
     def _on_step(self) -> bool:
@@ -77,6 +77,7 @@ class Watch(BaseCallback):
         self._errors.append(infos["position_error"][counts])
         self._begun |= self._env.acted
         self._last |= {row: self.locals["infos"][row] for row in np.flatnonzero(self.locals["dones"]).tolist()}
+        self._whole = self._whole or len(self._last) >= self._begun.sum()  # others may be absent at first
         return True
 
     def _on_rollout_end(self) -> None:
@@ -88,7 +89,7 @@ class Watch(BaseCallback):
 
     @property
     def _ended(self) -> list[dict[str, Any]]:
-        return [*self._last.values()] if len(self._last) >= self._begun.sum() else []
+        return [*self._last.values()] if self._whole else []
 
     def figures(self) -> dict[str, float]:
         """Return the figures of a `Status`."""

@@ -111,6 +111,9 @@ def test_every_vehicle_counts_once_however_short_its_episodes() -> None:
         assert "return" not in watch.figures(), "the second is still under way"
         watch.locals = {"dones": np.array([*dones, False]), "infos": [*ends, {}]}
         watch._on_step()
+    env.acted[2] = True  # it was absent until now
+    watch.locals["dones"][:] = False
+    watch._on_step()
     assert watch.figures() == {"return": -5.0, "arrival_rate": 0.5, "collision_rate": 0.5}
 
 
