@@ -3,13 +3,16 @@
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, needing
 from coopenv.cli import options
+
+if TYPE_CHECKING:
+    from coopenv.training.ranking import Ranking
 
 Settings = Annotated[Path | None, typer.Option(help="TOML file of the settings (default: see docs/trainers.md).")]
 Agent = Annotated[
@@ -33,7 +36,10 @@ class TrainOptions:
     steps: Annotated[
         int | None, typer.Option(min=1, help="Decisions of vehicles to learn from, in whole rollouts.")
     ] = None
-    minutes: Annotated[float | None, typer.Option(min=1e-3, help="Minutes to learn, instead of --steps.")] = None
+    minutes: Annotated[float | None, typer.Option(min=1e-3, help="Longest time to learn, min; stops --steps.")] = None
+    start: Annotated[
+        str | None, typer.Option("--from", help="Learned agent that the training continues.", **options.AGENT)
+    ] = None
     overrides: options.Overrides = None
     out: Annotated[Path | None, typer.Option(help="The agent's folder (default: out/train/ENV).")] = None
     resume: Annotated[
@@ -64,7 +70,7 @@ class TrainOptions:
             except CoopenvError as error:  # of the settings, because the options alone are possible
                 raise CoopenvError(str(error).replace(OVERRIDES, str(self.settings or "settings"), 1)) from None
             return plan
-        decided = {"--override": self.overrides}
+        decided = {"--override": self.overrides, "--from": self.start}
         decided |= {
             f"--{name}": getattr(self, name) for name in ("agent", "settings", "arm", "seed", "steps", "minutes")
         }
@@ -79,7 +85,10 @@ class TrainOptions:
         from coopenv.policies import find_agent
         from coopenv.training.settings import SETTINGS_FILE, read_settings, usual_settings
 
-        path, budget = self.settings, {"steps": self.steps, "minutes": self.minutes}
+        path, changes = self.settings, {"steps": self.steps, "minutes": self.minutes, "start": self.start}
+        if path is None and self.arm is None and self.start is not None:  # as it was trained
+            beside = (find_agent(self.start).folder or Path()) / SETTINGS_FILE
+            path = beside if beside.is_file() and self.agent is None else None
         if self.agent is not None:
             if path is not None:
                 raise CoopenvError("--agent and --settings: give one of them")
@@ -88,10 +97,8 @@ class TrainOptions:
                 raise CoopenvError(f"--agent {self.agent}: there is no {SETTINGS_FILE} beside it, so it was not learnt")
             path = folder / SETTINGS_FILE
         if path is None and self.arm is None:
-            if self.steps is not None and self.minutes is not None:
-                raise CoopenvError("--steps and --minutes: give one of them")
-            return usual_settings(self.environment, overrides, **budget)
-        return read_settings(path, self.arm, Path(self.environment).stem, **budget)
+            return usual_settings(self.environment, overrides, **changes)
+        return read_settings(path, self.arm, Path(self.environment).stem, **changes)
 
 
 @options.command
@@ -112,12 +119,17 @@ def train(given: TrainOptions) -> None:
     folder = given.out or Path("out", "train", Path(given.environment).stem)
     plan, log = given.plan(folder), options.console(stderr=True)
 
-    def judged(at: int, results: list[Any]) -> None:
-        log.print(f"{at:>10,} steps, held-out maps: {_figures(results)}", soft_wrap=True)
+    rankings: list[Ranking] = []
+
+    def judged(name: str, results: list[Any]) -> None:
+        log.print(f"{name:>16}, held-out maps: {_figures(results)}", soft_wrap=True)
 
     with Progress(log, "starting", total=1.0) as progress:
         reports = Reports(
-            lambda status: progress.update(status.share, status.line), judged, lambda line: progress.update(0.0, line)
+            lambda status: progress.update(status.share, status.line),
+            judged,
+            lambda line: progress.update(0.0, line),
+            rankings.append,
         )
         results = perform(
             plan,
@@ -129,12 +141,16 @@ def train(given: TrainOptions) -> None:
             force=given.force,
             reports=reports,
         )
+    (ranking,) = rankings
     if given.as_json:
-        options.print_json({"agent": str(folder), "results": [asdict(result) for result in results]})
+        rows = {"ranking": ranking.order, "missing": ranking.missing, "notes": ranking.notes}
+        options.print_json({"agent": str(folder), "results": [asdict(result) for result in results], **rows})
         return
     options.console().print(
         f"Agent in {folder}: coopenv run {given.environment} --policy {quote(str(folder))}", soft_wrap=True
     )
+    for line in (*ranking.notes, ranking.line):
+        options.console().print(line, soft_wrap=True)
 
 
 def _figures(results: list[Any]) -> str:

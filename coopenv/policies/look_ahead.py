@@ -131,6 +131,20 @@ class LookAhead(RouteFollower):
         steering, points = self.path(observations, plan, blocked)
         return np.minimum(self.speed(observations, points), self._pace[plan] * self.cruise), steering
 
+    def rule(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what a learned policy has to keep to: (rows,) each.
+
+        Returns:
+            flags of rows that drive by a plan, because something stands in the way or they are so far off the route
+            that plans lead back; speeds, m/s, which give way; steering angles of the plans, rad.
+        """
+        blocked, plan = self.blocked(observations), np.zeros(len(observations), dtype=int)
+        plans = blocked | (np.abs(self.read(observations, "route_offset")[:, 0]) > self.farthest)
+        due = np.flatnonzero(plans)
+        plan[due] = self.planned(observations, due)
+        around, points = self.path(observations, plan, blocked)
+        return plans, self.speed(observations, points), around
+
     def blocked(self, observations: np.ndarray) -> np.ndarray:
         """Return whether something stands in the way of the rows: (rows,)."""
         return np.asarray(~self.clear(observations, self.route_points(observations)[0]))

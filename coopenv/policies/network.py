@@ -15,6 +15,7 @@ from safetensors.numpy import load
 from coopenv.api.terms.layout import Layout, observation_layout, settings_of_meaning
 from coopenv.base.errors import AgentWarning, CoopenvError
 from coopenv.policies.loader import NetworkCard, NetworkColumn
+from coopenv.policies.look_ahead import LookAhead
 from coopenv.scenario import Scenario
 
 ENTRY = f"{__name__}:Network"
@@ -25,6 +26,8 @@ SLACK = 0.01
 """By which entries may lie beyond."""
 FIRST_LOOK = 100
 """Rows, at least, before it does."""
+CRITIC = "critic."
+"""Beginning of the names of tensors that only a further training needs."""
 
 
 def layout_tables(layout: Layout) -> tuple[dict[str, NetworkColumn], dict[str, NetworkColumn]]:
@@ -48,6 +51,23 @@ def layout_hash(
     """Return the first 16 hexadecimal digits of SHA-256 over the three tables as JSON."""
     tables = [{name: entry.model_dump() for name, entry in table.items()} for table in (observation, action)]
     return sha256(json.dumps([*tables, dict(settings)]).encode()).hexdigest()[:16]
+
+
+class RightOfWay:
+    """A rule below a policy, see `LookAhead.rule`: no speed is larger than its speed, and its plans go first."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Build it. Raises ValueError: the observation lacks what the rule needs."""
+        self._driver = LookAhead(scenario)
+        self.agents, self.reset = self._driver.agents, self._driver.reset
+
+    def __call__(self, observations: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """Return actions (rows, A) by the rule; rows are those of all vehicles."""
+        (plans, *wanted), found = self._driver.rule(observations), np.array(actions)
+        speed, steering = (f.level(w) for f, w in zip(self._driver.layout.action, wanted, strict=False))
+        found[:, 0] = np.where(plans, speed, np.minimum(found[:, 0], speed))
+        found[:, 1] = np.where(plans, np.clip(steering, -1.0, 1.0), found[:, 1])
+        return found
 
 
 class Network:
@@ -89,24 +109,34 @@ class Network:
             raise CoopenvError(f"{folder / 'agent.toml'}: network.layout is not the hash of its tables")
         self._clip = np.float32(network.clip)
         tensors = load_weights(path, network.sha256)
+        tensors = {name: values for name, values in tensors.items() if not name.startswith(CRITIC)}
         depth = _depth_of(path, tensors, len(self._columns), len(action))
         self._mean, self._std = tensors["observation.mean"], tensors["observation.std"]
         self._layers = [(tensors[f"layers.{i}.weight"].T.copy(), tensors[f"layers.{i}.bias"]) for i in range(depth)]
         self._name, self._seen, self._rows = folder.resolve().name, dict(network.seen), 0
         self._places = {name: slice(observation[name].start, observation[name].stop) for name in self._seen}
         self._outside = dict.fromkeys(self._seen, 0.0)
+        self._rule = RightOfWay(scenario) if network.right_of_way else None
+        self.agents = self._rule.agents if self._rule else []
+        """Names of the vehicles in the order of rows, where a rule needs the rows of all."""
+
+    def reset(self, mask: np.ndarray) -> None:
+        """Begin new episodes in the rows of a mask."""
+        if self._rule:
+            self._rule.reset(mask)
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return the actions, (rows, A) in [-1, 1], for flat observations, (rows, D)."""
-        observations = np.clip(observations * self._factor, -1.0, 1.0)
+        seen = np.clip(observations * self._factor, -1.0, 1.0)
         if self._seen:
-            self._compare_with_training(observations[observations.any(axis=1)])
-        scaled = (observations[:, self._columns] - self._mean) / self._std
+            self._compare_with_training(seen[seen.any(axis=1)])
+        scaled = (seen[:, self._columns] - self._mean) / self._std
         values = np.clip(scaled, -self._clip, self._clip).astype(np.float32)
         for weight, bias in self._layers[:-1]:
             values = np.tanh(values @ weight + bias)
         weight, bias = self._layers[-1]
-        return np.asarray(np.clip(values @ weight + bias, -1.0, 1.0))
+        actions = np.asarray(np.clip(values @ weight + bias, -1.0, 1.0))
+        return self._rule(np.asarray(observations, dtype=np.float32), actions) if self._rule else actions
 
     def _compare_with_training(self, observations: np.ndarray) -> None:
         """Warn, once, where many entries of a field lie beyond those of the training."""

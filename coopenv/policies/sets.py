@@ -64,13 +64,9 @@ class SetDriver(LookAhead):
 
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
         """See `Driver.drive`."""
-        vehicle, blocked = np.arange(len(observations)) % len(self._top), self.blocked(observations)
-        plans = blocked | (np.abs(self.read(observations, "route_offset")[:, 0]) > self.farthest)
-        plan, due = np.zeros(len(observations), dtype=int), np.flatnonzero(plans)
-        plan[due] = self.planned(observations, due)
-        around, points = self.path(observations, plan, blocked)
-        steering = np.where(plans, around, self.steer(self.inputs(observations, vehicle)))
-        return self.speed(observations, points), steering
+        plans, speed, around = self.rule(observations)
+        vehicle = np.arange(len(observations)) % len(self._top)
+        return speed, np.where(plans, around, self.steer(self.inputs(observations, vehicle)))
 
     def inputs(self, observations: np.ndarray, vehicle: np.ndarray) -> Inputs:
         """Return what the network sees in rows that are of these vehicles, (rows,)."""

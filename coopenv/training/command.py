@@ -7,8 +7,8 @@ while writing keeps the one before.
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Mapping
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,13 +27,14 @@ from coopenv.base import interrupts
 from coopenv.base.errors import CoopenvError, OutputError, evaluation_seed
 from coopenv.base.files import check_file, new_folder, replacing_file, replacing_folder, writing
 from coopenv.evaluation import Result, drive, held_out_seeds, score
-from coopenv.policies import load_agent
+from coopenv.policies import Policy, load_agent
 from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE
 from coopenv.scenario import Scenario
 from coopenv.training.export import EXPORTED, check_onnx, export
+from coopenv.training.ranking import Figures, Ranking, figures_of, ranking_key
 from coopenv.training.sets import SetTrainer
 from coopenv.training.settings import TrainingPlan, check_settings, environment_file
-from coopenv.training.trainer import DivergedError, Status, Trainer
+from coopenv.training.trainer import Arrays, DivergedError, Status, Trainer, tensors_of
 
 NAMES = (*EXPORTED, CHECKPOINT_FILE, *CARD_FILES)
 """Names of files in an agent's folder; a card belongs to a single agent, and is removed with it."""
@@ -43,9 +44,10 @@ WHILE_LEARNING = 2**30
 
 
 KEPT_FOR = 60.0  # s of learning after which at the latest there is a checkpoint
-FORMAT = 2
+FORMAT = 3
 HEADER = "coopenv_checkpoint"
-Arrays = dict[str, np.ndarray]
+Judge = Callable[[Policy, str, list[int]], list[Result]]
+"""Returns the figures of a driver, with its name, in the worlds of some seeds."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +56,29 @@ class Reports:
 
     status: Callable[[Status], None] = lambda status: None
     """After every update."""
-    judged: Callable[[int, list[Result]], None] = lambda steps, results: None
-    """After every look at held-out maps: decisions of vehicles so far, and figures."""
+    judged: Callable[[str, list[Result]], None] = lambda name, results: None
+    """After every look at held-out maps: name of the driver, or decisions of vehicles so far, and figures."""
     cloning: Callable[[str], None] = lambda line: None
-    """Before the first update, where another driver is cloned: a line on the progress."""
+    """Before the first update: a line on what is done, such as the cloning of another driver."""
+    ranked: Callable[[Ranking], None] = lambda ranking: None
+    """At the end."""
+
+
+class Course(BaseModel):
+    """Findings of a training so far, beside the state of its trainer."""
+
+    model_config = ConfigDict(ser_json_inf_nan="constants")
+    curve: list[dict[str, int | float]] = Field(default_factory=list)
+    """Figures in worlds for validation, a row per look."""
+    drivers: dict[str, Figures] = Field(default_factory=dict)
+    """Figures of other drivers, and of the clone, in the held-out worlds of the end."""
+    best: dict[str, Any] = Field(default_factory=dict, exclude=True)
+    """Tensors of the policy of the best row of the curve."""
+
+    @property
+    def best_row(self) -> dict[str, int | float]:
+        """The best row of the curve; the first of equal ones."""
+        return min(self.curve, key=ranking_key)
 
 
 def resumed_plan(out: Path) -> TrainingPlan:
@@ -81,6 +102,8 @@ def possible(plan: TrainingPlan) -> Scenario:
     scenario = open_simulation(plan.environment, plan.all_overrides)
     if not any(scenario.acting):
         raise CoopenvError(f"{plan.environment}: all motion is prescribed or has a driver, there is nothing to learn")
+    if plan.settings.start is not None:
+        tensors_of(plan.settings.start, scenario)
     for own in plan.watched():
         try:
             for each, _ in own.scenarios():
@@ -140,67 +163,114 @@ def train(
     check_settings(out, plan, environment)
     if onnx:
         check_onnx(plan.settings)
+    course = kept.course if kept is not None else Course()
+    seeds = held_out_seeds(0, plan.settings.evaluation.final_worlds)
+    judge = partial(_judge, scenario, threads, report)
     if plan.settings.network and plan.settings.clone:
+        _judge_drivers(plan, scenario, course, report, judge)
         cloned = SetTrainer(plan, scenario, plan.settings.clone, threads)
         cloned.begin(report.cloning)
-        results = _judge(cloned, threads, report, held_out_seeds(0, plan.settings.evaluation.final_worlds))
+        results = judge(cloned.mean_action, out.name, seeds)
         with replacing_folder(out, (*NAMES, environment.name, *environment.code)) as folder:
             export(folder, out, cloned, environment, results, [])
+        report.ranked(_ranking(out, course, results, ()))
         return results
-    curve = kept.curve if kept is not None else []
     with closing(Trainer(plan, scenario, threads)) as trainer:
-        judge = partial(_judge, trainer, threads, report)
         with new_folder(out), new_folder(logs or out / LOGS) as tensorboard:
             check_file(path)
             trainer.model.set_logger(configure(str(tensorboard), ["tensorboard"]))
         if kept is not None:
             restore(kept, trainer)
         else:
+            _judge_drivers(plan, scenario, course, report, judge)
             trainer.begin(report.cloning)
+            if plan.settings.steps and (plan.settings.clone or plan.settings.start):
+                first = "clone" if plan.settings.clone else "start"
+                course.drivers[first] = figures_of(judge(trainer.mean_action, first, seeds))
         try:
-            _learn(trainer, curve, report, judge, partial(save, path, trainer, curve, onnx, logs))
-            results = judge(held_out_seeds(0, plan.settings.evaluation.final_worlds))
+            _learn(trainer, course, report, judge, partial(save, path, trainer, course, onnx, logs))
+            if course.best:
+                trainer.take(course.best)
+            results = judge(trainer.mean_action, out.name, seeds)
         except DivergedError as error:
             if not path.is_file():
                 raise
             left = f"{path} is kept as it was after {read(path).progress['steps']} steps"
             raise DivergedError(f"{error}; {left}, remove it to begin anew with other settings") from None
         with replacing_folder(out, (*NAMES, environment.name, *environment.code)) as folder:
-            export(folder, out, trainer, environment, results, curve, onnx)
+            export(folder, out, trainer, environment, results, course.curve, onnx)
+        report.ranked(_ranking(out, course, results, _notes(trainer, course)))
     return results
 
 
-def _learn(
-    trainer: Trainer,
-    curve: list[dict[str, float]],
-    report: Reports,
-    judge: Callable[[list[int]], list[Result]],
-    keep: Callable[[], None],
-) -> None:
-    """Update until the budget is spent; judge every so often. A checkpoint follows, or a minute's updates."""
-    evaluation, kept = trainer.plan.settings.evaluation, trainer.seconds
+def _ranking(out: Path, course: Course, results: list[Result], notes: Iterable[str]) -> Ranking:
+    """Return the rank of a policy by its folder's name, among the drivers that were judged before."""
+    name = f"new {out.name}" if out.name in course.drivers else out.name
+    return Ranking(name, {**course.drivers, name: figures_of(results)}, tuple(notes))
+
+
+def _notes(trainer: Trainer, course: Course) -> Iterator[str]:
+    """Yield what is to be known of a training that did not go on to its end, or whose last policy is not the best."""
+    status, settings = trainer.status, trainer.plan.settings
+    yield from trainer.notes
+    if status.share < 1.0:
+        spent = f"{status.steps:,} of {settings.steps:,} steps"
+        yield f"Stopped by --minutes {settings.minutes:g} after {spent}: another load gives another agent"
+    if course.curve and (steps := course.best_row["steps"]) < status.steps:
+        yield f"Kept: the policy after {steps:,} steps, the best in the worlds for validation"
+
+
+def _judge_drivers(plan: TrainingPlan, scenario: Scenario, course: Course, report: Reports, judge: Judge) -> None:
+    """Judge the drivers that the policy is ranked among, as far as they can drive."""
+    seeds = held_out_seeds(0, plan.settings.evaluation.final_worlds)
+    cloned = [plan.settings.clone.agent] if plan.settings.clone else []
+    for name in dict.fromkeys((*cloned, *plan.settings.evaluation.drivers)):
+        with suppress(CoopenvError):
+            policy = load_agent(name, scenario)
+            report.cloning(f"judging {name}")
+            course.drivers[name] = figures_of(judge(policy, name, seeds))
+
+
+def _learn(trainer: Trainer, course: Course, report: Reports, judge: Judge, keep: Callable[[], None]) -> None:
+    """Update until all steps are done or time is up; judge every so often, and keep the best policy.
+
+    A checkpoint follows every look at worlds for validation, or a minute's updates.
+    """
+    settings, kept = trainer.plan.settings, trainer.seconds
+    evaluation, longest = settings.evaluation, 60.0 * (settings.minutes or np.inf)
+    seeds = [evaluation_seed(WHILE_LEARNING + world) for world in range(evaluation.worlds)]
+
+    def look() -> None:
+        status = trainer.status
+        means = figures_of(judge(trainer.mean_action, f"{status.steps:,} steps", seeds))
+        trainer.record(means)
+        course.curve.append({"steps": status.steps, "seconds": round(status.seconds, 1), **means})
+        if course.best_row is course.curve[-1]:
+            course.best = trainer.tensors()
+
     if trainer.status.steps == 0:
+        if settings.steps and (settings.clone or settings.start):
+            look()
         keep()
-    while trainer.status.share < 1.0:
-        before = trainer.status.steps // evaluation.every
+    while (status := trainer.status).share < 1.0 and trainer.seconds < longest:
+        before = status.steps // evaluation.every
         status = trainer.update()
         report.status(status)
-        due = status.steps // evaluation.every > before
-        if due and status.share < 1.0:
-            seeds = [evaluation_seed(WHILE_LEARNING + world) for world in range(evaluation.worlds)]
-            means = {result.metric: result.mean for result in judge(seeds)}
-            trainer.record(means)
-            curve.append({"steps": status.steps, "seconds": round(status.seconds, 1), **means})
-        if (due or status.seconds - kept > KEPT_FOR) and status.share < 1.0:
+        ends = status.share == 1.0 or trainer.seconds >= longest
+        if due := ends or status.steps // evaluation.every > before:
+            look()
+        if (due or status.seconds - kept > KEPT_FOR) and not ends:
             kept = status.seconds
             keep()
 
 
-def _judge(trainer: Trainer | SetTrainer, threads: int | None, report: Reports, seeds: list[int]) -> list[Result]:
-    """Return the figures of the mean action in held-out worlds."""
-    with closing(Engine(trainer.scenario, len(seeds), threads=threads)) as engine:
-        results = score(drive(engine, trainer.mean_action, seeds))
-    report.judged(trainer.status.steps, results)
+def _judge(
+    scenario: Scenario, threads: int | None, report: Reports, policy: Policy, name: str, seeds: list[int]
+) -> list[Result]:
+    """Return the figures of a driver in the worlds of some seeds."""
+    with closing(Engine(scenario, len(seeds), threads=threads)) as engine:
+        results = score(drive(engine, policy, seeds))
+    report.judged(name, results)
     return results
 
 
@@ -214,7 +284,7 @@ class Checkpoint(BaseModel):
     """JSON of the scenario, to find out whether it is still the same."""
     progress: dict[str, int | float]
     """`steps`, `seconds` and `cpu_seconds`."""
-    curve: list[dict[str, int | float]]
+    course: Course
     onnx: bool = False
     """Write an ONNX model, too, as on the command line."""
     logs: Path | None = None
@@ -224,9 +294,7 @@ class Checkpoint(BaseModel):
     """Arrays by the object that they restore, and by name."""
 
 
-def save(
-    path: Path, trainer: Trainer, curve: list[dict[str, float]], onnx: bool = False, logs: Path | None = None
-) -> None:
+def save(path: Path, trainer: Trainer, course: Course, onnx: bool = False, logs: Path | None = None) -> None:
     """Write a checkpoint in the place of the one before.
 
     Raises:
@@ -237,13 +305,14 @@ def save(
         plan=trainer.plan,
         scenario=trainer.scenario.model_dump_json(),
         progress={"steps": trainer.model.num_timesteps, **spent},
-        curve=curve,
+        course=course,
         onnx=onnx,
         logs=logs and logs.absolute(),
     )
     with replacing_file(path) as new, writing(path):
         try:
-            save_file(_arrays(trainer), new, metadata={HEADER: header.model_dump_json()})
+            best = {f"best/{name}": values for name, values in course.best.items()}
+            save_file({**_arrays(trainer), **best}, new, metadata={HEADER: header.model_dump_json()})
         except SafetensorError as error:  # what the system says of a full disk comes as one of these
             raise OSError(str(error)) from None
     interrupts.note(f"kept: {path} after {trainer.status.steps} steps; go on with --resume")
@@ -266,7 +335,9 @@ def read(path: Path) -> Checkpoint:
                 arrays[group][name] = file.get_tensor(key)
         if header["format"] != FORMAT:
             raise CoopenvError(f"{path}: a checkpoint of format {header['format']}, expected {FORMAT}")
-        return Checkpoint.model_validate({**header, "path": path, "arrays": arrays})
+        checkpoint = Checkpoint.model_validate({**header, "path": path, "arrays": arrays})
+        checkpoint.course.best = arrays["best"]
+        return checkpoint
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, CoopenvError):
             raise
@@ -282,22 +353,16 @@ def restore(checkpoint: Checkpoint, trainer: Trainer) -> None:
     if checkpoint.scenario != trainer.scenario.model_dump_json():
         name = trainer.plan.environment
         raise CoopenvError(f"{checkpoint.path}: {name} has changed since; remove the file to start anew")
-    policy, statistics, arrays = trainer.model.policy, trainer.env.statistics, checkpoint.arrays
+    policy, arrays = trainer.model.policy, checkpoint.arrays
     try:
-        policy.load_state_dict(_tensors(arrays["policy"]), strict=True)
+        if checkpoint.course.best:
+            trainer.take(checkpoint.course.best)  # it fits, as it has to at the end
+        trainer.take(arrays["policy"])
         moments: dict[int, dict[str, torch.Tensor]] = defaultdict(dict)
         for name, values in _tensors(arrays.get("optimiser", {})).items():
             index, _, moment = name.partition("/")
             moments[int(index)][moment] = values
         policy.optimizer.load_state_dict({**policy.optimizer.state_dict(), "state": moments})
-        for name in ("mean", "var"):
-            found = arrays["statistics"][name]
-            if found.shape != statistics.mean.shape:
-                raise ValueError(f"statistics/{name} has shape {found.shape}")
-            setattr(statistics, name, found)
-        statistics.count = float(arrays["statistics"]["count"])
-        spread = arrays["statistics"]["spread"]
-        trainer.env.spread.mean, trainer.env.spread.var, trainer.env.spread.count = spread
         trainer.env.returns[...] = arrays["statistics"]["returns"]
         torch.set_rng_state(torch.from_numpy(arrays["random"]["torch"]))
         key, position = np.split(arrays["random"]["numpy"], [-1])
@@ -313,17 +378,12 @@ def restore(checkpoint: Checkpoint, trainer: Trainer) -> None:
 
 
 def _arrays(trainer: Trainer) -> Arrays:
-    policy, statistics = trainer.model.policy, trainer.env.statistics
-    moments = policy.optimizer.state_dict()["state"].items()
+    moments = trainer.model.policy.optimizer.state_dict()["state"].items()
     _, key, position, *_ = np.random.get_state()
     groups: dict[str, Mapping[str, Any]] = {
-        "policy": {name: values.numpy() for name, values in policy.state_dict().items()},
+        "policy": trainer.tensors(),
         "optimiser": {f"{index}/{name}": values.numpy() for index, row in moments for name, values in row.items()},
-        "statistics": {
-            **{name: getattr(statistics, name) for name in ("mean", "var", "count")},
-            "spread": np.array([getattr(trainer.env.spread, name) for name in ("mean", "var", "count")], dtype=float),
-            "returns": trainer.env.returns,
-        },
+        "statistics": {"returns": trainer.env.returns},
         "random": {"torch": torch.get_rng_state().numpy(), "numpy": np.append(key, np.uint32(position))},
         "world": _worlds(trainer),
     }

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import tomlkit
 from safetensors.numpy import save
-from torch import nn
 
 from coopenv.api.terms.layout import observation_layout, settings_of_meaning
 from coopenv.base.errors import CoopenvError
@@ -20,7 +19,7 @@ from coopenv.base.installation import install_command, needing, version, version
 from coopenv.evaluation import Result
 from coopenv.policies import sets
 from coopenv.policies.loader import AGENT_FILE, NetworkCard
-from coopenv.policies.network import ENTRY, layout_hash, layout_tables
+from coopenv.policies.network import CRITIC, ENTRY, layout_hash, layout_tables
 from coopenv.scenario import Scenario
 from coopenv.training.sets import SetTrainer
 from coopenv.training.settings import SETTINGS_FILE, EnvironmentFile, Settings, settings_digest, write_settings
@@ -56,7 +55,8 @@ def export(
         OutputError: it cannot be written, or see `check_settings`.
     """
     write_settings(folder, old, trainer.plan, environment)
-    tensors = trainer.tensors if isinstance(trainer, SetTrainer) else network_of(trainer)
+    tensors = trainer.tensors if isinstance(trainer, SetTrainer) else trainer.tensors()
+    tensors = {name: np.asarray(values, dtype=np.float32) for name, values in tensors.items()}
     weights = save(tensors)
     with writing(folder):
         (folder / WEIGHTS_FILE).write_bytes(weights)
@@ -73,18 +73,6 @@ def export(
                 writer.writerows(curve)
         if onnx:
             (folder / ONNX_FILE).write_bytes(onnx_model(tensors, trainer.plan.settings.ppo.observation_clip))
-
-
-def network_of(trainer: Trainer) -> dict[str, np.ndarray]:
-    """Return the tensors of the mean action, float32, by the names that `coopenv.policies.network` reads."""
-    policy = trainer.model.policy
-    layers: list[Any] = [layer for layer in policy.mlp_extractor.policy_net if isinstance(layer, nn.Linear)]
-    tensors = {"observation.mean": trainer.env.statistics.mean, "observation.std": trainer.env.std}
-    for i, layer in enumerate([*layers, policy.action_net]):
-        tensors[f"layers.{i}.weight"] = layer.weight.detach().numpy()
-        tensors[f"layers.{i}.bias"] = layer.bias.detach().numpy()
-    tensors["log_std"] = policy.log_std.detach().numpy()
-    return {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in tensors.items()}
 
 
 def scenario_digest(scenario: Scenario) -> str:
@@ -110,6 +98,7 @@ def _network(trainer: Trainer, digest: str) -> NetworkCard:
             for name, field in observation.items()
             if name != "time_left"  # goes on for vehicles that have arrived
         },
+        right_of_way=trainer.plan.settings.right_of_way,
     )
 
 
@@ -198,6 +187,7 @@ def onnx_model(tensors: Mapping[str, np.ndarray], clip: float) -> bytes:
     """Return an ONNX model from raw observations, (rows, D), to actions, (rows, A) in [-1, 1]; see `check_onnx`."""
     from onnx import TensorProto, checker, helper, numpy_helper
 
+    tensors = {name: values for name, values in tensors.items() if not name.startswith(CRITIC)}
     constants = {**tensors, "clip.low": np.float32(-clip), "clip.high": np.float32(clip)}
     constants |= {"action.low": np.float32(-1.0), "action.high": np.float32(1.0)}
     del constants["log_std"]

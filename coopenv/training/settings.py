@@ -118,15 +118,22 @@ class EvaluationSettings(Section):
     """Held-out worlds of an evaluation during training, one episode each."""
     final_worlds: Several = 256
     """Held-out worlds of the last evaluation, for the results in `agent.toml`."""
+    drivers: tuple[str, ...] = ("peek", "look_ahead")
+    """Drivers that the result is ranked among, beside the cloned driver and the clone; those that can drive here."""
 
 
 class Settings(Section):
     """Everything that decides how a training goes, but for environment and seed."""
 
-    steps: Annotated[int, Field(ge=0, le=2**31)] | None = None
-    """Length of the training, decisions of vehicles (default: 2 million); 0: the clone alone."""
+    steps: Annotated[int, Field(ge=0, le=2**31)] = 2_000_000
+    """Length of the training, decisions of vehicles; 0: the clone alone."""
     minutes: Positive | None = None
-    """Length of the training, min, instead of `steps`."""
+    """Longest time of learning, min; a training that it stops depends on the machine and its load."""
+    start: str | None = None
+    """Learned agent that the training continues, name or folder, with its critic and normalisation."""
+    right_of_way: bool = False
+    """Limit the speeds to those at which the driver `look_ahead` gives way, and follow its plans where a vehicle stands
+    in the way or the route is too far away."""
     scenario: dict[str, Any] = Field(default={})
     """Overrides of the scenario, as tables or dotted keys, as with `--override`."""
     randomised: dict[str, Any] = Field(default={})
@@ -145,18 +152,13 @@ class Settings(Section):
             raise ValueError(f"network: '{self.network}' learns by a clone alone: set clone.agent and steps = 0")
         if self.steps == 0 and self.clone is None:
             raise ValueError("steps: 0 is for a clone alone, nothing is learnt without [clone]")
+        if self.start is not None and self.clone is not None:
+            raise ValueError("start: a training begins as an agent or as a [clone], give one of them")
         if sum(variation.share for variation in self.variations) > 1.0:
             raise ValueError("variations: their shares add up to more than 1")
         if not self.network and self.clone is not None and self.clone.elsewhere is not None:
             raise ValueError("clone.elsewhere: only with network = 'sets', since observations differ")
         return self
-
-    @property
-    def budget(self) -> tuple[int | None, float | None]:
-        """Steps and seconds at which to end; one of them is None."""
-        if self.minutes is not None:
-            return None, 60.0 * self.minutes
-        return 2_000_000 if self.steps is None else self.steps, None
 
 
 @dataclass(frozen=True)
@@ -244,8 +246,8 @@ def read_settings(
     for place, change in changed.items():
         raw = merged(raw, _flattened(change, f"{where}: {place}"))
     raw.update({name: value for name, value in changes.items() if value is not None})
-    if "steps" in raw and "minutes" in raw:
-        raise CoopenvError(f"{where}: steps and minutes: give one of them")
+    if changes.get("start") is not None:
+        raw.pop("clone", None)
     return validated(Settings, json.dumps(raw, default=str), where)
 
 
@@ -253,18 +255,24 @@ def usual_settings(environment: str, overrides: Mapping[str, Any], **changes: An
     """Return the settings of a training of which nothing else is said.
 
     They are those of the agents that ship with coopenv, where the driver that these begin as can drive; in other
-    environments without their reward, and without variations that are not possible.
+    environments without their reward, and without variations that are not possible. Several vehicles keep the right of
+    way by the rule.
     """
     name, changed = Path(environment).stem, {key: value for key, value in changes.items() if value is not None}
     shipped = read_settings(data_directory("agents") / SETTINGS_FILE, USUAL_ARM, name)
-    settings = shipped.model_copy(update={"steps": None, **changed} if "minutes" in changed else changed)
+    settings = shipped.model_copy(update={**changed, **({"clone": None} if "start" in changed else {})})
     if f"{environment}_{USUAL_ARM}" not in list_agents():
         settings = settings.model_copy(update={"scenario": {}})
     try:
+        scenario = open_simulation(environment, overrides)
         if settings.clone is not None:
-            load_agent(settings.clone.agent, open_simulation(environment, overrides))
+            load_agent(settings.clone.agent, scenario)
     except CoopenvError:
         return read_settings(None, None, name, **changes)
+    often = min(settings.evaluation.every, max(1, settings.steps // LOOKS))
+    evaluation = settings.evaluation.model_copy(update={"every": often})
+    usual = {"evaluation": evaluation, "right_of_way": len(scenario.vehicles) > 1}
+    settings = settings.model_copy(update=usual)
     fitting = []
     for own in settings.variations:
         with suppress(CoopenvError):
@@ -275,6 +283,8 @@ def usual_settings(environment: str, overrides: Mapping[str, Any], **changes: An
 
 
 USUAL_ARM = "quality"
+LOOKS = 8
+"""Evaluations, at least, of a training with `usual_settings`."""
 
 
 def _tables(tables: Any, where: str) -> dict[str, dict[str, Any]]:

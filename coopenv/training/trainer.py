@@ -18,16 +18,17 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from torch import nn
 
+from coopenv.api.terms.layout import observation_layout
 from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv, LeanPpo, TanhPolicy, differentiate, outputs
 from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.base.errors import CoopenvError
 from coopenv.evaluation.metrics import SETTLED_FROM
-from coopenv.policies import decide, load_agent, restart
+from coopenv.policies import decide, find_agent, load_agent, restart
+from coopenv.policies.network import CRITIC, RightOfWay, layout_tables, load_weights
 from coopenv.scenario import Scenario
 from coopenv.training.settings import Clone, Ppo, TrainingPlan
 
-EPISODES = 200
-"""Last episodes of vehicles over which is averaged."""
+Arrays = dict[str, np.ndarray]
 SEEN = 256
 """Last decisions whose observations are kept, for the range of each field."""
 
@@ -40,9 +41,10 @@ class Status:
     """Decisions of vehicles so far."""
     seconds: float
     share: float
-    """Share of the budget, 0 to 1."""
+    """Share of the decisions to learn from, 0 to 1."""
     figures: dict[str, float]
-    """`return`, `arrival_rate` and `collision_rate` over the last episodes; `e50_m` and `e95_m` in the last rollout."""
+    """`return`, `arrival_rate` and `collision_rate` over the last episode of every vehicle, as soon as each has one;
+    `e50_m` and `e95_m` in the last rollout."""
 
     @property
     def line(self) -> str:
@@ -57,27 +59,37 @@ class Status:
 
 
 class Watch(BaseCallback):
-    """Collects errors of the rollout and ends of episodes, and records both for TensorBoard."""
+    """Collects errors of the rollout and ends of episodes, and records both for TensorBoard.
+
+    Every row counts once, whether its episodes are short or long: crashes end first.
+    """
 
     def __init__(self, env: CooperativeSB3VecEnv) -> None:
         super().__init__()
         self._env = env
         self._errors: list[np.ndarray] = []
-        self._ended: deque[dict[str, Any]] = deque(maxlen=EPISODES)
+        self._begun, self._whole = np.zeros(env.num_envs, dtype=bool), False
+        self._last: dict[int, dict[str, Any]] = {}
 
     def _on_step(self) -> bool:
         infos = self._env.batch_infos
         counts = self._env.acted & (infos["time"] > SETTLED_FROM)
         self._errors.append(infos["position_error"][counts])
-        self._ended.extend(self.locals["infos"][row] for row in np.flatnonzero(self.locals["dones"]))
+        self._begun |= self._env.acted
+        self._last |= {row: self.locals["infos"][row] for row in np.flatnonzero(self.locals["dones"]).tolist()}
+        self._whole = self._whole or len(self._last) >= self._begun.sum()  # others may be absent at first
         return True
 
     def _on_rollout_end(self) -> None:
         for name, value in self.figures().items():
             self.logger.record(f"vehicles/{name}", value)
-        for name in self._env.engine.reward_terms if self._ended else ():
-            mean = np.mean([info["reward_terms"][name] for info in self._ended])
-            self.logger.record(f"reward_terms/{name}", float(mean))
+        ended = self._ended
+        for name in self._env.engine.reward_terms if ended else ():
+            self.logger.record(f"reward_terms/{name}", float(np.mean([info["reward_terms"][name] for info in ended])))
+
+    @property
+    def _ended(self) -> list[dict[str, Any]]:
+        return [*self._last.values()] if self._whole else []
 
     def figures(self) -> dict[str, float]:
         """Return the figures of a `Status`."""
@@ -85,9 +97,9 @@ class Watch(BaseCallback):
         errors = np.concatenate(self._errors) if self._errors else np.empty(0)
         if errors.size:
             found |= {"e50_m": float(np.median(errors)), "e95_m": float(np.percentile(errors, 95))}
-        if self._ended:
-            outcomes = [info["outcome"] for info in self._ended]
-            found["return"] = float(np.mean([info["episode"]["r"] for info in self._ended]))
+        if ended := self._ended:
+            outcomes = [info["outcome"] for info in ended]
+            found["return"] = float(np.mean([info["episode"]["r"] for info in ended]))
             found["arrival_rate"] = outcomes.count("arrived") / len(outcomes)
             found["collision_rate"] = outcomes.count("collided") / len(outcomes)
         return found
@@ -161,8 +173,8 @@ class NormalisedEnv(VecEnvWrapper):
 
     venv: CooperativeSB3VecEnv
 
-    def __init__(self, venv: CooperativeSB3VecEnv, ppo: Ppo) -> None:
-        """Wrap a batch."""
+    def __init__(self, venv: CooperativeSB3VecEnv, ppo: Ppo, rule: RightOfWay | None = None) -> None:
+        """Wrap a batch; a rule is below the actions of the policy."""
         shape = venv.observation_space.shape
         super().__init__(
             venv,
@@ -175,6 +187,7 @@ class NormalisedEnv(VecEnvWrapper):
         self.returns = np.zeros(venv.num_envs)
         self.looked_at: deque[np.ndarray] = deque(maxlen=SEEN)
         self._present: np.ndarray | None = None
+        self._rule, self._raw = rule, np.empty(0)
 
     def start(self) -> None:
         """Start episodes already now; the next `reset` goes on from there."""
@@ -182,7 +195,7 @@ class NormalisedEnv(VecEnvWrapper):
 
     def go_on_from(self, observations: np.ndarray) -> None:
         """Let the next `reset` go on from raw observations of episodes under way instead of starting new ones."""
-        self._present = self.normalise(observations)
+        self._present, self._raw = self.normalise(observations), observations
 
     def normalise(self, observations: np.ndarray) -> np.ndarray:
         """Return observations as the policy sees them."""
@@ -212,13 +225,18 @@ class NormalisedEnv(VecEnvWrapper):
         if self._present is not None:
             present, self._present = self._present, None
             return present
-        observations = self.venv.reset()
+        self._raw = observations = self.venv.reset()
         self.statistics.update(observations)
         return self.normalise(observations)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Take the actions, (num_envs, A)."""
+        self.venv.step_async(self._rule(self._raw, actions) if self._rule else actions)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Step, and update the statistics of the observations of vehicles under way."""
         observations, rewards, dones, infos = self.venv.step_wait()
+        self._raw = observations
         if self.venv.acted.any():
             self.statistics.update(observations[self.venv.acted])
             self.looked_at.append(observations[self.venv.acted])
@@ -231,6 +249,8 @@ class NormalisedEnv(VecEnvWrapper):
         return self.normalise(observations), rewards * self.reward_scale, dones, infos
 
 
+COUNTS = f"{CRITIC}counts"
+"""Tensor of an agent's weights: count of the observations; mean, variance and count of the returns."""
 BATCH = 512  # rows per gradient step
 
 
@@ -242,8 +262,12 @@ def watch(
     seed: int,
     threads: int,
     report: Callable[[str], None],
+    rule: RightOfWay | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return observations (rows, D), the driver's actions (rows, A), discounted returns and vehicles (rows,)."""
+    """Return observations (rows, D), the driver's actions (rows, A), discounted returns and vehicles (rows,).
+
+    Where the rule alone would slow the vehicle down as much, the speed is the largest one.
+    """
     env = CooperativeVectorEnv(scenario, "clone", num_worlds=worlds, autoreset="disabled", threads=threads)
     driver, noise = load_agent(settings.agent, scenario), np.random.default_rng(seed)
     observation, _ = env.reset(seed=seed)
@@ -256,6 +280,8 @@ def watch(
         tried = np.clip(action + settings.noise * noise.standard_normal(action.shape), -1.0, 1.0)
         before, acted = observation, under_way
         observation, reward, terminated, truncated, _ = env.step(tried.astype(np.float32))
+        if rule:
+            action[rule(before, np.ones_like(action))[:, 0] <= action[:, 0], 0] = 1.0
         steps.append((before, action, np.where(acted, reward, 0.0), acted))
         under_way = acted & ~(terminated | truncated)
     env.close()
@@ -285,6 +311,21 @@ def regress(
             optimiser.zero_grad()
             slopes(rows)
             optimiser.step()
+
+
+def tensors_of(name: str, scenario: Scenario) -> Arrays:
+    """Return the tensors of a learned agent that a training in a scenario can continue.
+
+    Raises:
+        CoopenvError: there is no such agent, it is another kind of driver, or it observes something else.
+    """
+    agent, here = find_agent(name), layout_tables(observation_layout(scenario))
+    if agent.folder is None or agent.network is None or not agent.network.observation:
+        raise CoopenvError(f"start: {name} is no policy that PPO learns; clone.agent begins as any driver")
+    agent.policy(scenario)
+    if (agent.network.observation, agent.network.action) != here:
+        raise CoopenvError(f"start: {name} was trained with other fields or scales of the observation")
+    return load_weights(agent.folder / agent.network.weights, agent.network.sha256)
 
 
 TORCH_REFUSES = "Expected parameter"
@@ -317,8 +358,9 @@ class Trainer:
         parts = [
             CooperativeSB3VecEnv(built(each, plan.environment, num_worlds=count)) for each, count in self._scenarios
         ]
+        self.rule, rule = (RightOfWay(scenario) if plan.settings.right_of_way else None for _ in range(2))
         self.batch = parts[0] if len(parts) == 1 else MixedWorlds(parts)
-        self.env = NormalisedEnv(self.batch, ppo)
+        self.env = NormalisedEnv(self.batch, ppo, rule)
         self._rollout = ppo.decisions * self.env.num_envs
         self._share, self.seconds, self.cpu_seconds = 0.0, 0.0, 0.0
         widths = list(ppo.hidden)
@@ -347,15 +389,27 @@ class Trainer:
         )
         self.model.set_logger(Logger(None, []))
         self._watch = Watch(self.batch)
+        self.notes: list[str] = []
+        """Remarks for the end."""
 
     def begin(self, report: Callable[[str], None] = lambda line: None) -> None:
-        """Clone another driver, if settings name one, and start the first episodes; `report` gets progress lines."""
+        """Begin as an agent or a clone, where settings name one, and start episodes; `report` gets progress lines."""
+        start, widths = self.plan.settings.start, self.plan.settings.ppo.hidden
+        if start is not None:
+            tensors = tensors_of(start, self.scenario)
+            try:
+                self.take(tensors)
+            except (RuntimeError, KeyError, ValueError) as error:
+                raise CoopenvError(f"start: {start} has not the widths ppo.hidden = {[*widths]}: {error}") from None
+            if COUNTS not in tensors:
+                self.notes.append(f"{start} was saved without a critic: a new one learnt from its episodes")
+                self._imitate(Clone(agent=start), report, critic_only=True)
         if self.plan.settings.clone is not None:
             self._imitate(self.plan.settings.clone, report)
         self.env.start()
 
     @torch.no_grad()
-    def _imitate(self, clone: Clone, report: Callable[[str], None]) -> None:
+    def _imitate(self, clone: Clone, report: Callable[[str], None], critic_only: bool = False) -> None:
         """Fit the mean action to a driver's actions, and the value to the discounted rewards that follow.
 
         Its observations are also the first in the statistics for normalisation. Noise is added to its actions, so that
@@ -366,22 +420,28 @@ class Trainer:
         watched = []
         for place, (each, count) in enumerate(self._scenarios):
             worlds, start = max(1, clone.episodes * count // all_worlds), seed + APART * place
-            watched.append(watch(each, worlds, clone, ppo.gamma, start, threads, report))
+            rule = RightOfWay(each) if self.rule else None
+            watched.append(watch(each, worlds, clone, ppo.gamma, start, threads, report, rule))
         raw, actions, returns, _ = (np.concatenate(column) for column in zip(*watched, strict=True))
-        self.env.statistics.update(raw)
+        if critic_only:
+            self.env.statistics.count = len(raw)
+        else:
+            self.env.statistics.update(raw)
         self.env.looked_at.append(raw)
         observations = torch.from_numpy(self.env.normalise(raw))
         targets = torch.from_numpy(actions.astype(np.float32))
+        networks = policy.layers()[critic_only:]
         self.env.spread.update(returns)
         values = torch.from_numpy((self.env.reward_scale * returns).astype(np.float32)).unsqueeze(1)
 
         def slopes(rows: torch.Tensor) -> None:
-            for layers, aims in zip(policy.layers(), (targets[rows], values[rows]), strict=True):
+            for layers, aims in zip(networks, (targets[rows], values[rows])[critic_only:], strict=True):
                 found = outputs(layers, observations[rows])
                 excess = found[-1] - aims
                 differentiate(layers, found, 2.0 / excess.numel() * excess)
 
-        regress(policy.parameters(), len(observations), clone, seed, slopes, report)
+        chosen = (part for layers in networks for layer in layers for part in layer.parameters())
+        regress(chosen, len(observations), clone, seed, slopes, report)
 
     def update(self) -> Status:
         """Collect one rollout and learn from it.
@@ -404,7 +464,8 @@ class Trainer:
             DivergedError: it is not finite.
         """
         with self._finite():
-            return np.asarray(self.model.predict(self.env.normalise(observations), deterministic=True)[0])
+            actions = np.asarray(self.model.predict(self.env.normalise(observations), deterministic=True)[0])
+        return self.rule(observations, actions) if self.rule else actions
 
     @contextmanager
     def _finite(self) -> Iterator[None]:
@@ -430,9 +491,40 @@ class Trainer:
         return Status(self.model.num_timesteps, self.seconds, self._spent(), self._watch.figures())
 
     def _spent(self) -> float:
-        steps, seconds = self.plan.settings.budget
-        share = self.model.num_timesteps / steps if steps else self.seconds / (seconds or math.inf)
-        return 1.0 if steps == 0 else min(1.0, share)
+        steps = self.plan.settings.steps
+        return min(1.0, self.model.num_timesteps / steps) if steps else 1.0
+
+    def tensors(self) -> Arrays:
+        """Return a copy of networks and normalisation by the names of an agent's weights."""
+        env, found = self.env, {name: values.detach().numpy() for name, values in self._parameters().items()}
+        found |= {"observation.mean": env.statistics.mean, "observation.std": env.std}
+        found[COUNTS] = np.array([env.statistics.count, env.spread.mean, env.spread.var, env.spread.count])
+        return {name: np.array(values) for name, values in found.items()}
+
+    @torch.no_grad()
+    def take(self, tensors: Arrays) -> None:
+        """Go on from a result of `tensors`; where it has no critic, the present one stays.
+
+        Raises:
+            KeyError, RuntimeError, ValueError: networks have other widths, or a number is not finite.
+        """
+        env = self.env
+        if wrong := [name for name, values in tensors.items() if not np.isfinite(values).all()]:
+            raise ValueError(f"{wrong[0]} is not finite")
+        env.statistics.mean[...] = tensors["observation.mean"]
+        env.statistics.var[...] = tensors["observation.std"].astype(float) ** 2 - LEAST_VARIANCE
+        for name, values in self._parameters().items():
+            if COUNTS in tensors or not name.startswith(CRITIC):
+                values.copy_(torch.from_numpy(tensors[name]))
+        if COUNTS in tensors:
+            env.statistics.count, env.spread.mean, env.spread.var, env.spread.count = map(float, tensors[COUNTS])
+
+    def _parameters(self) -> dict[str, torch.Tensor]:
+        """Return the learnt parameters by the names of an agent's weights."""
+        networks = zip(("", CRITIC), self.model.policy.layers(), strict=True)
+        each = [(f"{prefix}layers.{i}", layer) for prefix, layers in networks for i, layer in enumerate(layers)]
+        found = {f"{name}.{part}": getattr(layer, part) for name, layer in each for part in ("weight", "bias")}
+        return {**found, "log_std": self.model.policy.log_std}
 
     def record(self, figures: dict[str, float]) -> None:
         """Write figures of the mean action on held-out maps for TensorBoard."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,19 +11,20 @@ import pytest
 pytest.importorskip("stable_baselines3", reason="needs the extra 'train'")
 
 import torch
+from safetensors.numpy import load_file
 
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.api.trainers.sb3 import make_sb3_vec_env
 from coopenv.evaluation import Result, drive, held_out_seeds, score
 from coopenv.policies import Policy, load_agent
-from coopenv.policies.network import Network
+from coopenv.policies.network import Network, RightOfWay
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import REWARD_TERMS
 from coopenv.training.command import train
-from coopenv.training.export import export, network_of, onnx_model
+from coopenv.training.export import export, onnx_model
 from coopenv.training.settings import Clone, EvaluationSettings, Ppo, Settings, TrainingPlan, environment_file
-from coopenv.training.trainer import LEAST_VARIANCE, NormalisedEnv, Trainer
+from coopenv.training.trainer import LEAST_VARIANCE, NormalisedEnv, Trainer, Watch
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.train
@@ -51,7 +53,7 @@ def test_numpy_and_onnx_agree_with_torch(trained: Trainer, tmp_path: Path) -> No
     assert isinstance(agent, Network)
     assert agent(observations) == pytest.approx(expected, abs=1e-5)
     reference = pytest.importorskip("onnx.reference", reason="needs the extra 'onnx'")
-    data = onnx_model(network_of(trained), trained.plan.settings.ppo.observation_clip)
+    data = onnx_model(load_file(tmp_path / "weights.safetensors"), trained.plan.settings.ppo.observation_clip)
     (tmp_path / "policy.onnx").write_bytes(data)
     model = reference.ReferenceEvaluator(str(tmp_path / "policy.onnx"))
     assert model.run(None, {"observation": observations})[0] == pytest.approx(expected, abs=1e-5)
@@ -99,12 +101,39 @@ def test_rewards_are_scaled_by_the_running_spread_of_returns() -> None:
     assert len(rewards[7]) < 60
 
 
-def test_a_budget_in_minutes_is_spent_by_the_clock() -> None:
-    trainer = trainer_of(minutes=1e-6)
-    assert trainer.status.share == 0.0
-    assert trainer.update().share == 1.0
-    trainer.model.num_timesteps, trainer.seconds = 128, 3e-5
-    assert (trainer.status.steps, trainer.status.share) == (128, pytest.approx(0.5))
+def test_every_vehicle_counts_once_however_short_its_episodes() -> None:
+    """The first crashes three times until the second arrives: one of the two has arrived, not one of four episodes."""
+    env = SimpleNamespace(num_envs=3, acted=np.array([True, True, False]))
+    env.batch_infos = {"time": np.zeros(3), "position_error": np.zeros(3)}
+    watch = Watch(env)
+    ends = [{"outcome": name, "episode": {"r": value}} for name, value in (("collided", -20.0), ("arrived", 10.0))]
+    for dones in ([True, False], [True, False], [True, True]):
+        assert "return" not in watch.figures(), "the second is still under way"
+        watch.locals = {"dones": np.array([*dones, False]), "infos": [*ends, {}]}
+        watch._on_step()
+    env.acted[2] = True  # it was absent until now
+    watch.locals["dones"][:] = False
+    watch._on_step()
+    assert watch.figures() == {"return": -5.0, "arrival_rate": 0.5, "collision_rate": 0.5}
+
+
+def test_a_rule_limits_the_speeds_of_training_and_agent(tmp_path: Path) -> None:
+    settings = Settings(ppo=SMALL, steps=1024, right_of_way=True)
+    trainer = Trainer(TrainingPlan("open_square", settings, 0), coopenv.load_scenario("open_square"), threads=1)
+    trainer.begin()
+    trainer.update()
+    rows = trainer.batch.engine.view("observation").reshape(16, -1).copy()
+    free = np.asarray(trainer.model.predict(trainer.env.normalise(rows), deterministic=True)[0])
+    full = np.tile(np.float32([1.0, 0.0]), (16, 1))
+    rule = RightOfWay(trainer.scenario)
+    assert trainer.mean_action(rows) == pytest.approx(rule(rows, free))
+    limits = rule(rows, full)[:, 0]
+    trainer.env.step_async(full)
+    assert np.array_equal(trainer.batch._actions[:, 0], limits)
+    export(tmp_path, tmp_path, trainer, environment_file("open_square"), [], [])
+    agent = load_agent(tmp_path, trainer.scenario)
+    assert agent(rows) == pytest.approx(trainer.mean_action(rows), abs=1e-5)
+    assert agent.agents == list(trainer.scenario.vehicle_names)
 
 
 @pytest.mark.parametrize("broken", ["weights", "exploration"])

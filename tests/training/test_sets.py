@@ -31,7 +31,7 @@ SETTINGS = Settings(
     steps=0,
     ppo=Ppo(hidden=(32, 32)),
     clone=Clone(agent="look_ahead", episodes=1, epochs=2, elsewhere=EVERYWHERE),
-    evaluation=EvaluationSettings(final_worlds=2),
+    evaluation=EvaluationSettings(final_worlds=2, drivers=()),
 )
 PLAN = TrainingPlan("facade", SETTINGS, 0)
 

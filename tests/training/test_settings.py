@@ -53,16 +53,22 @@ def path(tmp_path: Path) -> Path:
 
 def test_defaults() -> None:
     settings = read_settings(None)
-    assert settings.budget == (2_000_000, None)
+    assert (settings.steps, settings.minutes) == (2_000_000, None)
     assert (settings.ppo.vehicles, settings.ppo.decisions, settings.ppo.hidden) == (512, 64, (128, 128))
     assert settings.clone is None
 
 
 def test_a_training_of_which_nothing_is_said_begins_as_the_planner_where_that_can_drive() -> None:
     settings = usual_settings("open_square", {}, steps=None)
-    assert settings == read_settings(data_directory("agents") / "train.toml", "quality", "open_square")
+    shipped = read_settings(data_directory("agents") / "train.toml", "quality", "open_square")
+    assert settings.right_of_way and settings.evaluation.every == settings.steps // 8
+    assert settings.model_copy(update={"right_of_way": False, "evaluation": shipped.evaluation}) == shipped
+    assert not usual_settings("facade", {}).right_of_way, "a single vehicle gives way to none"
     assert settings.clone and settings.clone.agent == "look_ahead" and settings.variations and settings.randomised
-    assert usual_settings("open_square", {}, minutes=2.0).budget == (None, 120.0)
+    capped = usual_settings("open_square", {}, minutes=2.0)
+    assert (capped.minutes, capped.steps) == (2.0, shipped.steps), "minutes stop a training, and do not plan it"
+    further = usual_settings("open_square", {}, start="my_driver", steps=80)
+    assert (further.start, further.clone, further.evaluation.every) == ("my_driver", None, 10)
     assert usual_settings("open_square", {"observation.exclude": ["map"]}) == read_settings(None)
     assert usual_settings("large_crossing", {}).scenario == {}, "its reward is its own"
 
@@ -126,7 +132,9 @@ def test_an_environment_goes_before_all_and_an_arm_before_it(path: Path) -> None
 
 
 def test_the_command_line_goes_before_the_file(path: Path) -> None:
-    assert read_settings(path, steps=7).budget == (7, None)
+    assert read_settings(path, steps=7, minutes=2.0).steps == 7
+    path.write_text(FILE + "[clone]\nagent = 'peek'\n")
+    assert read_settings(path).clone and read_settings(path, start="my_driver").clone is None
     plan = TrainingPlan("urban_crossing", read_settings(path), 3, None, {"rates.decision": 10.0})
     assert plan.all_overrides["rates.decision"] == 10.0
 
@@ -145,7 +153,7 @@ def test_a_plan_survives_as_plain_data(path: Path) -> None:
         ("[ppo]\nvehicles = 1\ndecisions = 1", r"train\.toml: ppo\.decisions: one decision of one vehicle"),
         ("[ppo]\nhidden = []", r"train\.toml: ppo\.hidden: .*at least 1"),
         ("[clone]\nepisodes = 3", r"train\.toml: clone\.agent: Field required"),
-        ("steps = 10\nminutes = 1", r"train\.toml: steps and minutes: give one of them"),
+        ("start = 'mine'\nclone.agent = 'peek'", r"a training begins as an agent or as a \[clone\], give one of them"),
         ("scenario = 3", r"train\.toml: scenario: expected a table"),
         ("[environments.facade]\narms = 3", r"train\.toml: environments\.facade\.arms: expected tables by name"),
         ("arms = 3", r"train\.toml: arms: expected tables by name"),

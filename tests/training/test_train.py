@@ -9,13 +9,15 @@ import shlex
 import signal
 import sys
 from contextlib import chdir, redirect_stdout
+from hashlib import sha256
 from io import StringIO
 from pathlib import Path
 from subprocess import Popen
+from time import monotonic
 
 import numpy as np
 import pytest
-from safetensors.numpy import load_file
+from safetensors.numpy import load_file, save_file
 
 pytest.importorskip("stable_baselines3", reason="needs the extra 'train'")
 pytest.importorskip("tensorboard", reason="needs the extra 'train'")
@@ -25,8 +27,10 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cli.app import main
 from coopenv.policies import find_agent, load_agent
 from coopenv.policies.loader import read_card
-from coopenv.training.command import train
-from coopenv.training.settings import TrainingPlan, read_settings
+from coopenv.training.command import Course, Reports, possible, train
+from coopenv.training.ranking import Ranking
+from coopenv.training.settings import Ppo, TrainingPlan, read_settings
+from coopenv.training.trainer import Trainer
 from tests.helpers.processes import COOPENV, start, wait_until
 
 pytestmark = pytest.mark.train
@@ -44,8 +48,9 @@ epochs = 2
 every = 800
 worlds = 2
 final_worlds = 4
+drivers = ["peek"]
 """
-STEPS = [800, 1600, 2400]
+STEPS = [800, 1600, 2400, 3200]
 
 
 @pytest.fixture
@@ -103,7 +108,9 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "train.toml").write_text(SETTINGS)
     with chdir(folder), redirect_stdout(StringIO()) as printed:
         assert main(fresh("--json")) == 0
-    metrics = {row["metric"]: row for row in json.loads(printed.getvalue())["results"]}
+    document = json.loads(printed.getvalue())
+    metrics = {row["metric"]: row for row in document["results"]}
+    assert sorted(document["ranking"]) == ["agent", "peek"], "nothing was cloned"
     assert metrics["e95_m"]["ci_low"] <= metrics["e95_m"]["mean"] <= metrics["e95_m"]["ci_high"]
     return folder / "agent"
 
@@ -273,7 +280,8 @@ def test_an_environment_that_changed_since(here: Path, capsys: pytest.CaptureFix
     ("arguments", "message"),
     [
         (["train", "overtaking"], "all motion is prescribed or has a driver, there is nothing to learn"),
-        (["train", "urban_crossing", "--steps", "5", "--minutes", "1"], "--steps and --minutes: give one of them"),
+        (["train", "urban_crossing", "--from", "peek"], "start: peek is no policy that PPO learns"),
+        (["train", "urban_crossing", "--from", "facade_quality"], "it was trained with another observation"),
         (
             ["train", "urban_crossing", "--agent", "route_follower"],
             "--agent route_follower: there is no train.toml beside it",
@@ -366,3 +374,86 @@ def test_a_clone_alone_is_an_agent(here: Path) -> None:
     card = read_card(here / "agent")
     assert card.training["steps"] == 0 and card.network and card.network.seen
     assert not (here / "agent" / "checkpoint.safetensors").exists()
+
+
+CLONED = SETTINGS.replace("steps = 3000", "steps = 800").replace("every = 800", "every = 400")
+CLONED += "[clone]\nagent = 'route_follower'\nepisodes = 2\nepochs = 2\n"
+
+
+def trained(folder: Path, text: str, **options: object) -> tuple[dict[str, np.ndarray], Ranking]:
+    """Return the weights of a training by some settings, and its rank."""
+    (folder / "own.toml").write_text(text)
+    found: list[Ranking] = []
+    plan = TrainingPlan("urban_crossing", read_settings(folder / "own.toml", **options), 5)
+    train(plan, folder / "agent", threads=1, force=True, reports=Reports(ranked=found.append))
+    return load_file(folder / "agent" / "weights.safetensors"), found[0]
+
+
+def test_weights_do_not_depend_on_the_clock(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a machine that is 10,000 times as slow, a checkpoint follows every update, and the agent is the same."""
+    weights, _ = trained(here, CLONED, minutes=1e9)
+    monkeypatch.setattr("coopenv.training.trainer.monotonic", lambda: 1e4 * monotonic())
+    slow, ranking = trained(here, CLONED, minutes=1e9)
+    assert not [note for note in ranking.notes if "minutes" in note]
+    for name, values in weights.items():
+        assert np.array_equal(values, slow[name]), name
+
+
+def test_findings_survive_in_a_checkpoint() -> None:
+    """Where no vehicle arrives, the travel time is not a number."""
+    course = Course(curve=[{"steps": 800, "travel_time_s": np.nan}], drivers={"peek": {"travel_time_s": np.nan}})
+    again = Course.model_validate(json.loads(course.model_dump_json()))
+    assert repr(again) == repr(course)
+
+
+def test_a_clone_that_learning_makes_worse_is_kept(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every later policy arrives less often in the worlds for validation, so the agent is the clone."""
+    looks = iter([0.9, 0.5, 0.4, 0.3])
+    key = "coopenv.training.command.ranking_key"
+    seen: dict[int, float] = {}
+    monkeypatch.setattr(key, lambda row: (-seen.setdefault(row["steps"], next(looks, 0.0)), 0.0))
+    weights, ranking = trained(here, CLONED)
+    clone, _ = trained(here, CLONED.replace("steps = 800", "steps = 0"))
+    for name, values in clone.items():
+        assert np.array_equal(values, weights[name]), name
+    assert {*ranking.drivers} == {"route_follower", "peek", "clone", "agent"}
+    own, begun = (ranking.drivers[name]["e95_m"] for name in ("agent", "clone"))
+    assert own == pytest.approx(begun, rel=1e-4)
+    assert ranking.notes == ("Kept: the policy after 0 steps, the best in the worlds for validation",)
+
+
+def test_minutes_stop_a_training_and_say_so(here: Path) -> None:
+    _, ranking = trained(here, SETTINGS, minutes=1e-6)
+    assert ranking.notes == ("Stopped by --minutes 1e-06 after 400 of 3,000 steps: another load gives another agent",)
+
+
+def test_a_training_continues_an_agent_with_its_critic(here: Path) -> None:
+    """An agent of before has no critic: a new one is learnt, while the policy begins as it was."""
+    before, _ = trained(here, SETTINGS.replace("steps = 3000", "steps = 400"))
+    (here / "agent").rename(here / "first")
+    settings = read_settings(here / "first" / "train.toml", start=str(here / "first"))
+    plan = TrainingPlan("urban_crossing", settings, 6)
+    trainer = Trainer(plan, possible(plan), threads=1)
+    trainer.begin()
+    after = trainer.tensors()
+    assert trainer.notes == [] and {*after} == {*before}
+    for name, values in before.items():
+        assert "layers" not in name or np.array_equal(after[name], values), name
+    assert after["critic.counts"][0] == pytest.approx(before["critic.counts"][0] + 16), "the first observations"
+    without_critic(here / "first")
+    trainer = Trainer(plan, possible(plan), threads=1)
+    trainer.begin()
+    assert "was saved without a critic" in trainer.notes[0]
+    assert after["layers.1.weight"] == pytest.approx(trainer.tensors()["layers.1.weight"])
+    assert after["critic.layers.1.weight"] != pytest.approx(trainer.tensors()["critic.layers.1.weight"], abs=1e-3)
+    other = TrainingPlan("urban_crossing", settings.model_copy(update={"ppo": Ppo(hidden=(8,))}), 6)
+    with pytest.raises(CoopenvError, match=r"first has not the widths ppo\.hidden = \[8\]"):
+        Trainer(other, possible(other), threads=1).begin()
+
+
+def without_critic(folder: Path) -> None:
+    """Leave an agent as an earlier version saved it."""
+    path, card = folder / "weights.safetensors", folder / "agent.toml"
+    digest = sha256(path.read_bytes()).hexdigest()
+    save_file({name: v for name, v in load_file(path).items() if not name.startswith("critic.")}, path)
+    card.write_text(card.read_text().replace(digest, sha256(path.read_bytes()).hexdigest()))

@@ -70,7 +70,10 @@ class CooperativeSB3VecEnv(VecEnv):
         self.scenario, self.vehicles = envs.scenario, envs.vehicles
         self.render_mode, self.metadata = "rgb_array", envs.metadata
         self.acted = np.zeros(envs.num_envs, dtype=bool)
-        """(num_envs,) whether the row's vehicle was under way in the last step, and acts (any, where none does)."""
+        """(num_envs,) whether the row's vehicle was under way in the last step, and acts (any, where none does).
+
+        With a team reward a vehicle that has arrived is no longer under way, although its episode goes on."""
+        self._parked = np.zeros(envs.num_envs, dtype=bool)
         self.batch_infos: dict[str, Any] = {}
         """Infos of the last step as `CooperativeVectorEnv` gives them, arrays (num_envs,)."""
         self._recorder = RecordVehicleEpisodes(envs)
@@ -94,6 +97,7 @@ class CooperativeSB3VecEnv(VecEnv):
         Options are those of `CooperativeVectorEnv.reset`; its settings hold until they are given again.
         """
         observation, self.batch_infos = self._recorder.reset(seed=self._seeds[0], options=self._options[0] or None)
+        self._parked = self.batch_infos["ended"] != Outcome.UNDER_WAY
         self._reset_seeds()
         self._reset_options()
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -114,6 +118,7 @@ class CooperativeSB3VecEnv(VecEnv):
             raise CoopenvError(f"sums of episodes: expected finite numbers of shape {self._recorder.sums.shape}")
         self.engine.set_state({name: values for name, values in state.items() if name != "episode_sums"})
         self._recorder.sums[...] = sums
+        self._parked = self.engine.view("ended").reshape(-1) != Outcome.UNDER_WAY
         return self.engine.view("observation").reshape(self.num_envs, -1).copy()
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -128,7 +133,8 @@ class CooperativeSB3VecEnv(VecEnv):
         """
         observation, rewards, _, truncated, after = self._recorder.step(self._actions)
         self.batch_infos = step = after.get("final_info", after)
-        self.acted = step["alive"] & self._rows
+        self.acted = step["alive"] & self._rows & ~self._parked
+        self._parked = after["ended"] != Outcome.UNDER_WAY
         dones = after.get("_episode", np.zeros(self.num_envs, dtype=bool)) & self._rows
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for row in np.flatnonzero(dones).tolist():

@@ -182,6 +182,21 @@ def test_buffer_gives_rows_under_way_alone() -> None:
     assert torch.equal(kept, torch.from_numpy(np.sort(acting)))
 
 
+def test_with_a_team_reward_vehicles_that_have_ended_do_not_act() -> None:
+    """Their episodes go on until the end of the world, but nothing that they do counts."""
+    env = make_sb3_vec_env(FOUR_WAY, num_worlds=2, overrides={"reward.team": "mean"}, seed=0)
+    env.reset()
+    actions = np.column_stack([np.ones(8), np.linspace(0.2, 0.5, 8)]).astype(np.float32)  # walls, one after another
+    before, parked = np.zeros(8, dtype=bool), 0
+    for _ in range(60):
+        _, _, dones, _ = env.step(actions)
+        assert np.array_equal(env.acted, ~before)
+        ended, over = env.batch_infos["ended"] != 0, dones.reshape(2, 4).all(axis=1).repeat(4)
+        parked += (before & env.batch_infos["alive"]).sum()
+        before = ended & ~over
+    assert parked > 20
+
+
 @pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 def test_copies_go_on_alike_and_apart(duplicate: Any) -> None:
     env = make_sb3_vec_env(FOUR_WAY, num_worlds=2, overrides={"horizon": 1.0}, seed=SEED)
