@@ -8,7 +8,7 @@ import numpy as np
 
 from coopenv.api.engine import Engine
 from coopenv.base.errors import evaluation_seed, world_keys
-from coopenv.estimation import Sight
+from coopenv.estimation import Outcome, Sight
 from coopenv.policies import Policy, decide, restart
 from coopenv.scenario import Scenario
 
@@ -47,6 +47,10 @@ class Episodes:
     """(W, N), an `Outcome`, or a condition of the scenario's own; negative: the vehicle was not there."""
     sees: np.ndarray
     """(K, W, N, N) bool: the vehicle measured another driven one in the last frame of the decision."""
+    goal: np.ndarray
+    """(W, N) bool: the vehicle has a goal at which its episode ends."""
+    horizon: int
+    """Number of decisions of an episode that nothing ends sooner."""
 
     @property
     def worlds(self) -> int:
@@ -78,18 +82,41 @@ class Episodes:
     @property
     def looking(self) -> np.ndarray:
         """(K, W, N) rad in [-pi, pi): where the camera looks, from the nearest piece of the route; NaN without one."""
-        way = np.full(self.heading.shape, np.nan)
-        nearest = np.full(self.heading.shape, np.inf)
+        way, _ = self._on_route(self.position[1:])
+        return np.asarray((self.heading + self.pan - way + np.pi) % (2 * np.pi) - np.pi)
+
+    @property
+    def lost_from(self) -> np.ndarray:
+        """(W, N) number of decisions after which a vehicle counts as lost until the horizon; `horizon`: never.
+
+        A vehicle is lost when it collides, leaves its route, or ends otherwise without an arrival at its goal. If it
+        has not arrived when the episode ends, that share of the episode is lost which is left of its route.
+        """
+        failed = np.isin(self.outcome, (Outcome.COLLIDED, Outcome.OFF_ROUTE)) | (self.goal & (self.arrivals[-1] == 0))
+        _, done = self._on_route(self.position[-1:])
+        stuck = np.floor(len(self.under_way) * np.nan_to_num(done[0]))
+        start = np.where(self.outcome == Outcome.UNDER_WAY, stuck, self.under_way.sum(axis=0))
+        return np.where(failed & self.present, start, self.horizon).astype(int)
+
+    def _on_route(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the direction, rad, of the nearest piece of the route, and the share of the route that lies behind.
+
+        Positions are (k, W, N, 2), m; both results are (k, W, N), NaN without a route.
+        """
+        way, behind = np.full(position.shape[:-1], np.nan), np.full(position.shape[:-1], np.nan)
+        nearest, length = np.full(position.shape[:-1], np.inf), np.zeros(self.outcome.shape)
         for begin, end in zip(np.moveaxis(self.route, 2, 0)[:-1], np.moveaxis(self.route, 2, 0)[1:], strict=True):
             leg = end - begin
             square = np.maximum((leg**2).sum(axis=-1), 1e-12)
-            offset = self.position[1:] - begin
+            offset = position - begin
             share = np.clip((offset * leg).sum(axis=-1) / square, 0.0, 1.0)
             distance = np.linalg.norm(offset - share[..., None] * leg, axis=-1)
             nearer = (distance < nearest) & (square > 1e-9)
             way = np.where(nearer, np.arctan2(leg[..., 1], leg[..., 0]), way)
+            behind = np.where(nearer, length + share * np.sqrt(square), behind)
             nearest = np.where(nearer, distance, nearest)
-        return np.asarray((self.heading + self.pan - way + np.pi) % (2 * np.pi) - np.pi)
+            length = length + np.sqrt(square)
+        return way, behind / np.maximum(length, 1e-6)
 
     @property
     def distance(self) -> np.ndarray:
@@ -203,7 +230,8 @@ def drive(
     kept, place, headings, sees = Views(engine, KEPT), [], [], []
     for tick in play(engine, seeds, ticks, policy, False, stride=scenario.ticks_per_decision):
         if tick == 0:
-            route = _routes(view("route")[:, chosen, :, :2], view("route_count")[:, chosen])
+            count = view("route_count")[:, chosen].copy()
+            route = _routes(view("route")[:, chosen, :, :2], count)
         kept.take()
         place.append(view("position")[:, agents, :2].astype(np.float32))
         forward = view("rotation")[:, agents][..., :2, 0]
@@ -222,6 +250,8 @@ def drive(
         route=route,
         outcome=view("ended")[:, chosen].copy(),
         sees=np.stack(sees[1:]),
+        goal=(count > 0) & scenario.termination.arrival,
+        horizon=-(-ticks // scenario.ticks_per_decision),
     )
 
 
