@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.base.errors import evaluation_seed, world_keys
+from coopenv.base.errors import CoopenvError, evaluation_seed, world_keys
 from coopenv.estimation import Outcome, Sight
 from coopenv.policies import Policy, decide, restart
 from coopenv.scenario import Scenario
 
+BLOCK_WORLDS, BLOCKS = 2**16, 2**14
+"""Number of worlds of a block of held-out seeds, and of blocks; the seeds after them judge agents while they learn."""
 DIVERGED = 1e9  # m or deg: stands for an error that is not a number
 
 
@@ -125,8 +127,15 @@ class Episodes:
 
 
 def held_out_seeds(block: int, worlds: int) -> list[int]:
-    """Return the seeds of so many worlds that no training has seen; blocks of one size share none."""
-    return [evaluation_seed(block * worlds + world) for world in range(worlds)]
+    """Return the seeds of the first so many worlds of a block; blocks share none, whatever the number of worlds.
+
+    Raises:
+        CoopenvError: there is no such block, or it has fewer worlds.
+    """
+    if not (0 <= block < BLOCKS and 0 <= worlds <= BLOCK_WORLDS):
+        limits = f"seed_block must be below {BLOCKS} and worlds at most {BLOCK_WORLDS}"
+        raise CoopenvError(f"{limits}, got {block} and {worlds}")
+    return [evaluation_seed(block * BLOCK_WORLDS + world) for world in range(worlds)]
 
 
 def driven_vehicles(scenario: Scenario) -> list[int]:

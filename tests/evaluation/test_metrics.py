@@ -11,8 +11,10 @@ from hypothesis import strategies as st
 
 import coopenv
 from coopenv.api.engine import Engine
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation import Outcome
 from coopenv.evaluation import METRICS, Episodes, compare_paired, drive, held_out_seeds, ranking_key, score
+from coopenv.evaluation.episodes import BLOCK_WORLDS, BLOCKS
 from coopenv.evaluation.metrics import LOST, Quantile, Ratio, interval, resamples, scored_errors
 from coopenv.policies import load_agent
 from coopenv.policies.base import zero_policy
@@ -94,9 +96,16 @@ def test_an_error_that_is_no_number_counts_as_a_huge_one(monkeypatch: pytest.Mon
     assert (found.position_error > 1e8).all() and (found.orientation_error < 1e3).all()
 
 
-def test_held_out_seeds_are_shared_by_no_two_blocks() -> None:
-    seeds = [seed for block in range(3) for seed in held_out_seeds(block, 5)]
-    assert len(set(seeds)) == 15 and min(seeds) >= 2**31
+def test_no_two_blocks_share_a_seed_whatever_the_number_of_worlds() -> None:
+    few, many = [{*held_out_seeds(block, 3)} for block in range(1, 90)], {*held_out_seeds(0, 256)}
+    assert many == {*range(2**31, 2**31 + 256)}  # those of the figures on cards
+    assert all(not many & block for block in few) and len(set().union(*few)) == 3 * 89
+    last = held_out_seeds(BLOCKS - 1, BLOCK_WORLDS)
+    assert min(last) > max(held_out_seeds(BLOCKS - 2, BLOCK_WORLDS)) and max(last) in coopenv.EVALUATION_SEEDS
+    assert max(last) < coopenv.evaluation_seed(2**30)  # from here on, seeds judge agents while they learn
+    for block, worlds in ((BLOCKS, 1), (0, BLOCK_WORLDS + 1)):
+        with pytest.raises(CoopenvError, match="seed_block must be below 16384 and worlds at most 65536"):
+            held_out_seeds(block, worlds)
 
 
 def test_vehicles_that_are_not_there_do_not_count(episodes: Episodes) -> None:
