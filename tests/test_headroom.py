@@ -15,6 +15,7 @@ from coopenv.api.engine import Engine
 from coopenv.bench.cards import Contest
 from coopenv.bench.pages import cooperation_settings
 from coopenv.evaluation import Difference, Episodes, compare_paired, drive, held_out_seeds, score
+from coopenv.evaluation.metrics import scored_errors
 from coopenv.policies import load_agent
 from coopenv.scenario import load_scenario
 from coopenv.scenario.learning import Difficulty
@@ -85,9 +86,8 @@ def team_episodes(
 
 
 def dependent_e95(found: Episodes, environment: str) -> float:
-    """Return the 95th percentile of the position error, m, of the vehicles that do not help, from 3 s on."""
-    counted = (found.under_way & (found.time >= 3.0)[:, None, None])[..., HELPERS[environment] :]
-    return float(np.quantile(found.position_error[..., HELPERS[environment] :][counted], 0.95))
+    """Return the 95th percentile of the scored position error, m, of the vehicles that do not help, from 3 s on."""
+    return float(np.quantile(scored_errors(found, vehicles=slice(HELPERS[environment], None))[0], 0.95))
 
 
 @pytest.mark.slow

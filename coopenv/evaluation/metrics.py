@@ -108,6 +108,8 @@ LOST = 1.0
 """Position error (m) that counts for a lost vehicle, and for every larger error."""
 LOSSES = 0.02
 """Step of the share of lost vehicles by which drivers are ranked before their errors."""
+SCORE = 2
+"""Version of e50 and e95, for files: 1, without number, left lost vehicles out."""
 FEW_TARGETS = 3
 """Fewer bearings than these do not determine a pose."""
 
@@ -137,9 +139,9 @@ def _counted(episodes: Episodes, start: float) -> np.ndarray:
     return np.asarray(episodes.under_way & (episodes.time >= start - 1e-9)[:, None, None])
 
 
-def _over_moments(counted: np.ndarray, values: np.ndarray) -> Ratio:
+def _over_moments(counted: np.ndarray, values: np.ndarray, root: bool = False) -> Ratio:
     """Return the mean of values (K, W, N) over the moments that count."""
-    return Ratio(np.where(counted, values, 0.0).sum(axis=(0, 2)), counted.sum(axis=(0, 2)))
+    return Ratio(np.where(counted, values, 0.0).sum(axis=(0, 2)), counted.sum(axis=(0, 2)), root)
 
 
 def scored_errors(
@@ -165,22 +167,15 @@ def scored_errors(
     return error[counted], np.nonzero(counted)[1]
 
 
-def _values(name: str, start: float, episodes: Episodes) -> tuple[np.ndarray, np.ndarray]:
-    """Return an error (M,) over the moments that count, and the world (M,) of each."""
-    if name == "position_error":
-        return scored_errors(episodes, start)
-    counted = _counted(episodes, start)
-    return getattr(episodes, name)[counted], np.nonzero(counted)[1]
-
-
 def _quantile(name: str, share: float, start: float, episodes: Episodes) -> Statistic:
-    return Quantile(*_values(name, start, episodes), episodes.worlds, share)
+    if name == "position_error":
+        return Quantile(*scored_errors(episodes, start), episodes.worlds, share)
+    counted = _counted(episodes, start)
+    return Quantile(getattr(episodes, name)[counted], np.nonzero(counted)[1], episodes.worlds, share)
 
 
 def _rmse(name: str, start: float, episodes: Episodes) -> Statistic:
-    values, world = _values(name, start, episodes)
-    squares = np.bincount(world, values.astype(float) ** 2, episodes.worlds)
-    return Ratio(squares, np.bincount(world, minlength=episodes.worlds), root=True)
+    return _over_moments(_counted(episodes, start), getattr(episodes, name).astype(float) ** 2, root=True)
 
 
 def _errors(quantity: str, unit: str, name: str, prefix: str = "") -> dict[str, Metric]:
@@ -191,7 +186,7 @@ def _errors(quantity: str, unit: str, name: str, prefix: str = "") -> dict[str, 
         for short, share, word in (("e50", 0.5, "Median"), ("e95", 0.95, "95th percentile")):
             meaning = f"{word} of the {quantity} error {span}{lost}"
             found[f"{prefix}{short}{when}_{unit}"] = Metric(meaning, unit, partial(_quantile, name, share, start))
-        meaning = f"Root mean square of the {quantity} error {span}{lost}"
+        meaning = f"Root mean square of the {quantity} error {span}"
         found[f"{prefix}rmse{when}_{unit}"] = Metric(meaning, unit, partial(_rmse, name, start))
     return found
 
@@ -216,14 +211,14 @@ def ranking_key(figures: Mapping[str, float]) -> tuple[float, float, float]:
     """Return a key by which drivers are sorted, the best first.
 
     The losses come first, in steps of `LOSSES`: the share of vehicles that do not arrive, plus the share of those that
-    collide. Drivers on one step are sorted by e95, and by the root mean square error where e95 is equal.
+    collide. Drivers on one step are sorted by e95, and by e50 where e95 is that of lost vehicles for both.
 
     Args:
         figures: values of `METRICS` by name.
     """
     losses = 1.0 - figures["arrival_rate"] + figures["collision_rate"]
-    e95, rmse = (float(np.nan_to_num(figures[name], nan=np.inf)) for name in ("e95_m", "rmse_m"))
-    return float(np.floor(losses / LOSSES + 1e-9)), e95, rmse
+    e95, e50 = (float(np.nan_to_num(figures[name], nan=np.inf)) for name in ("e95_m", "e50_m"))
+    return float(np.floor(losses / LOSSES + 1e-9)), e95, e50
 
 
 @dataclass(frozen=True)

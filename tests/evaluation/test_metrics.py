@@ -20,6 +20,7 @@ from coopenv.policies import load_agent
 from coopenv.policies.base import zero_policy
 from coopenv.runs import rollout
 from tests.helpers.four_way import FOUR_WAY
+from tests.helpers.trips import trips
 
 SCENARIO = coopenv.load_scenario(FOUR_WAY, {"horizon": 16.0})
 
@@ -198,44 +199,6 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
     assert 0.89 <= held / 300 <= 0.99
 
 
-def trips(
-    errors: list[float], arrived: np.ndarray, ended: np.ndarray, horizon: int = 80, speed: float = 1.0
-) -> Episodes:
-    """Return single-vehicle worlds of 0.5 s decisions on 20 m of road, each with one error all along.
-
-    Args:
-        errors: m, one per world.
-        arrived: (W,) bool; the others crash when they end, or are under way at the horizon.
-        ended: (W,) decisions after which a vehicle ends.
-        horizon: decisions.
-        speed: m/s.
-    """
-    W, K = len(errors), int(ended.max())
-    under_way = (np.arange(K)[:, None] < ended)[..., None]
-    place = np.minimum(np.arange(K + 1)[:, None], ended) * 0.5 * speed
-    route = np.broadcast_to(np.array([[0.0, 0.0], [20.0, 0.0]]), (W, 1, 2, 2))
-    outcome = np.where(arrived, Outcome.ARRIVED, np.where(ended < horizon, Outcome.COLLIDED, Outcome.UNDER_WAY))
-    nothing = np.zeros((K, W, 1))
-    return Episodes(
-        vehicles=("car",),
-        period=0.5,
-        under_way=under_way,
-        position_error=np.broadcast_to(np.array(errors)[:, None], (K, W, 1)).copy(),
-        orientation_error=nothing,
-        targets_in_view=nothing,
-        reward=nothing,
-        position=np.stack([place, np.zeros_like(place)], axis=-1)[:, :, None],
-        heading=nothing,
-        pan=nothing,
-        route=route,
-        arrivals=(arrived & (np.arange(1, K + 1)[:, None] >= ended))[..., None].astype(int),
-        outcome=outcome[:, None],
-        sees=np.zeros((K, W, 1, 1), dtype=bool),
-        goal=np.ones((W, 1), dtype=bool),
-        horizon=horizon,
-    )
-
-
 def figures(episodes: Episodes) -> dict[str, float]:
     return {name: metric.of(episodes).value for name, metric in METRICS.items()}
 
@@ -259,19 +222,16 @@ def test_a_crash_in_place_of_an_arrival_never_improves_the_score(data: st.DataOb
     before = figures(trips(errors, arrived, ended))
     crash = np.where(np.arange(W) == 0, data.draw(st.integers(1, int(ended[0]))), ended)
     after = figures(trips(errors, arrived & (np.arange(W) > 0), crash))
-    for name in ("e50_m", "e95_m", "rmse_m", "e50_episode_m", "e95_episode_m"):
+    for name in ("e50_m", "e95_m", "e50_episode_m", "e95_episode_m"):
         assert np.isnan(before[name]) or after[name] >= before[name] - 1e-12, name
     assert ranking_key(before) <= ranking_key(after)
 
 
 def test_an_early_crash_weighs_more_than_a_late_one() -> None:
-    early, late = (trips([0.1] * 50, np.arange(50) > 0, np.where(np.arange(50) > 0, 40, end)) for end in (5, 39))
-    assert (
-        figures(early)["rmse_m"]
-        > figures(late)["rmse_m"]
-        > figures(trips([0.1], np.array([True]), np.array([40])))["rmse_m"]
-    )
-    assert early.lost_from[0, 0] == 5 and late.lost_from[0, 0] == 39 and (early.lost_from[1:] == early.horizon).all()
+    early, late = (trips([0.1] * 20, np.arange(20) > 0, np.where(np.arange(20) > 0, 76, end)) for end in (5, 75))
+    assert early.lost_from[0, 0] == 5 and late.lost_from[0, 0] == 75 and (early.lost_from[1:] == early.horizon).all()
+    lost = [np.mean(scored_errors(driven)[0] == LOST) for driven in (early, late)]
+    assert lost == pytest.approx([75 / (75 + 19 * 71), 5 / (75 + 19 * 71)])
 
 
 def test_a_vehicle_that_has_not_arrived_at_the_horizon_is_lost_for_the_rest_of_its_route() -> None:
@@ -293,8 +253,8 @@ def test_the_interval_of_lost_vehicles_is_theirs() -> None:
 
 
 def test_losses_are_ranked_before_errors_and_errors_within_a_step() -> None:
-    def driver(arrived: float, collided: float, e95: float, rmse: float = 0.1) -> dict[str, float]:
-        return {"arrival_rate": arrived, "collision_rate": collided, "e95_m": e95, "rmse_m": rmse}
+    def driver(arrived: float, collided: float, e95: float, e50: float = 0.1) -> dict[str, float]:
+        return {"arrival_rate": arrived, "collision_rate": collided, "e95_m": e95, "e50_m": e50}
 
     ordered = [
         driver(1.0, 0.0, 0.1),
