@@ -309,10 +309,10 @@ COLUMNS = {
 """Metric, its heading, and the factor to the heading's unit."""
 EXPLANATIONS = {
     "intervals": "95 %, bootstrap over worlds",
-    "e50, e95": "median and 95th percentile of the error from 3 s on, of vehicles under way and, in cm, of lost ones",
-    "lost": f"collided or never arrived; the position error is then {LOST:g} m until the horizon, more never counts",
-    "score": f"e95 [cm] of the fleet; a ranking goes by the losses in steps of {100 * LOSSES:g} %, then by the score",
-    "few": "share of that time with fewer than three targets in view",
+    "e50, e95": "median and 95th percentile of the error from 3 s on, of vehicles under way",
+    "lost": f"collided, or never arrived: from then on, to the horizon, an error of {LOST:g} m; more never counts",
+    "score": f"e95 [cm] of the fleet; rankings go by losses in steps of {100 * LOSSES:g} %, then by the score",
+    "few": "share of the time from 3 s on with fewer than three targets in view",
     "return": "sum of the rewards of a vehicle",
 }
 """Legend of the tables."""
@@ -461,7 +461,8 @@ def measured(command: str, worlds: int, block: int, results: Mapping[str, Any]) 
 def save(folder: Path, description: str, card: Mapping[str, Any]) -> Path:
     """Write a card to an agent's folder, and return the path of the one for people."""
     replace_text(folder / JSON_FILE, json_text(card))
-    text = rendered("card.md.j2", card={"study": None, **card}, description=" ".join(description.split()))
+    old = any(entry.get("score", 1) < SCORE for entry in card["environments"].values())
+    text = rendered("card.md.j2", card={"study": None, **card}, old=old, description=" ".join(description.split()))
     replace_text(folder / TEXT_FILE, text)
     return folder / TEXT_FILE
 

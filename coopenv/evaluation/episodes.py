@@ -84,41 +84,32 @@ class Episodes:
     @property
     def looking(self) -> np.ndarray:
         """(K, W, N) rad in [-pi, pi): where the camera looks, from the nearest piece of the route; NaN without one."""
-        way, _ = self._on_route(self.position[1:])
+        way = np.full(self.heading.shape, np.nan)
+        nearest = np.full(self.heading.shape, np.inf)
+        for begin, end in zip(np.moveaxis(self.route, 2, 0)[:-1], np.moveaxis(self.route, 2, 0)[1:], strict=True):
+            leg = end - begin
+            square = np.maximum((leg**2).sum(axis=-1), 1e-12)
+            offset = self.position[1:] - begin
+            share = np.clip((offset * leg).sum(axis=-1) / square, 0.0, 1.0)
+            distance = np.linalg.norm(offset - share[..., None] * leg, axis=-1)
+            nearer = (distance < nearest) & (square > 1e-9)
+            way = np.where(nearer, np.arctan2(leg[..., 1], leg[..., 0]), way)
+            nearest = np.where(nearer, distance, nearest)
         return np.asarray((self.heading + self.pan - way + np.pi) % (2 * np.pi) - np.pi)
 
     @property
     def lost_from(self) -> np.ndarray:
         """(W, N) number of decisions after which a vehicle counts as lost until the horizon; `horizon`: never.
 
-        A vehicle is lost when it collides, leaves its route, or ends otherwise without an arrival at its goal. If it
-        has not arrived when the episode ends, that share of the episode is lost which is left of its route.
+        A vehicle is lost after a collision, off its route, and at any other end but an arrival at its goal. While under
+        way, it is lost for that share of the episode which the straight line to its goal is of its route.
         """
         failed = np.isin(self.outcome, (Outcome.COLLIDED, Outcome.OFF_ROUTE)) | (self.goal & (self.arrivals[-1] == 0))
-        _, done = self._on_route(self.position[-1:])
-        stuck = np.floor(len(self.under_way) * np.nan_to_num(done[0]))
-        start = np.where(self.outcome == Outcome.UNDER_WAY, stuck, self.under_way.sum(axis=0))
+        length = np.linalg.norm(np.diff(self.route, axis=2), axis=-1).sum(axis=-1)
+        left = np.linalg.norm(self.position[-1] - self.route[:, :, -1], axis=-1) / np.maximum(length, 1e-6)
+        slow = len(self.under_way) * (1.0 - np.clip(np.nan_to_num(left), 0.0, 1.0))
+        start = np.where(self.outcome == Outcome.UNDER_WAY, slow, self.under_way.sum(axis=0))
         return np.where(failed & self.present, start, self.horizon).astype(int)
-
-    def _on_route(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the direction, rad, of the nearest piece of the route, and the share of the route that lies behind.
-
-        Positions are (k, W, N, 2), m; both results are (k, W, N), NaN without a route.
-        """
-        way, behind = np.full(position.shape[:-1], np.nan), np.full(position.shape[:-1], np.nan)
-        nearest, length = np.full(position.shape[:-1], np.inf), np.zeros(self.outcome.shape)
-        for begin, end in zip(np.moveaxis(self.route, 2, 0)[:-1], np.moveaxis(self.route, 2, 0)[1:], strict=True):
-            leg = end - begin
-            square = np.maximum((leg**2).sum(axis=-1), 1e-12)
-            offset = position - begin
-            share = np.clip((offset * leg).sum(axis=-1) / square, 0.0, 1.0)
-            distance = np.linalg.norm(offset - share[..., None] * leg, axis=-1)
-            nearer = (distance < nearest) & (square > 1e-9)
-            way = np.where(nearer, np.arctan2(leg[..., 1], leg[..., 0]), way)
-            behind = np.where(nearer, length + share * np.sqrt(square), behind)
-            nearest = np.where(nearer, distance, nearest)
-            length = length + np.sqrt(square)
-        return way, behind / np.maximum(length, 1e-6)
 
     @property
     def distance(self) -> np.ndarray:
