@@ -7,8 +7,9 @@ from itertools import product
 
 import numpy as np
 
-from benchmarks.methods.study import ARRIVING, Results, StudyFile, improvement, rank, with_interval
+from benchmarks.methods.study import Results, StudyFile, improvement, rank, with_interval
 from coopenv.bench.pages import table
+from coopenv.evaluation.metrics import LOSSES
 
 SHOWN = {
     "arrived [%]": ("arrival_rate", 100.0),
@@ -29,9 +30,9 @@ Recordings are Minari datasets of {drivers}, with noise of {noise:g} on the acti
 differ from `{base}` in their settings, and in that observations are normalised.
 
 A cell is the interquartile mean over seeds with its 95 % interval (bootstrap over seeds). e95 is the 95th percentile of
-the position error of all vehicles under way, from 3 s on. *Better* is the probability that a run is better than one of
-`{base}`. Of two runs that both have at least {arriving:.0f} % arrivals, the one with the smaller e95 is better;
-otherwise, the one with more arrivals.
+the position error of all vehicles under way, from 3 s on: score 1, without lost vehicles. *Better* is the probability
+that a run is better than one of `{base}`: first by its losses (vehicles that do not arrive, plus those that collide)
+in steps of {losses:.0f} %, then by its e95.
 
 {tables}
 
@@ -56,7 +57,7 @@ def page(study: StudyFile, results: Results) -> str:
         drivers=" and ".join(f"`{driver}` in `{place}`" for place, driver in study.environments.items()),
         noise=study.noise,
         base=next(iter(study.methods)),
-        arriving=100.0 * ARRIVING,
+        losses=100.0 * LOSSES,
         tables=tables(study, results),
         minutes=sum(figures["cpu_seconds"] for figures in results.values()) / 60.0,
     )

@@ -24,13 +24,11 @@ from coopenv.backends.sources import open_simulation
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
 from coopenv.base.sections import Section, read_toml, validated
-from coopenv.evaluation.metrics import interval
+from coopenv.evaluation.metrics import interval, ranking_key
 
 FIGURES = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m", "return")
 """Of the metrics of `coopenv evaluate`, those that are kept."""
 COLUMNS = ("environment", "method", "seed", "digest", "cpu_seconds", *FIGURES)
-ARRIVING = 0.9
-"""Share of arrivals from which runs are compared by their e95; those with fewer come after all of these."""
 RESAMPLES = 4000
 
 
@@ -147,9 +145,9 @@ def write_results(path: Path, results: Results) -> None:
 
 
 def rank(figures: Figures) -> float:
-    """Return a number that is larger for the better run: of those that arrive the one with less e95, then arrivals."""
-    arrived = figures["arrival_rate"]
-    return 1.0 / (1.0 + figures["e95_m"]) if arrived >= ARRIVING else arrived - 1.0
+    """Return a number that is larger for the better run, by the steps of losses and then e95, as `ranking_key`."""
+    losses, e95, _ = ranking_key(figures)
+    return 1.0 / (1.0 + e95) - losses
 
 
 def interquartile_mean(values: np.ndarray) -> np.ndarray:

@@ -25,6 +25,7 @@ from coopenv.base.format import NONE, json_text
 from coopenv.base.installation import is_installed, load_reference, version
 from coopenv.base.terminal import text_of
 from coopenv.evaluation import METRICS, Difference, Episodes, Result, compare_paired, drive, held_out_seeds, score
+from coopenv.evaluation.metrics import LOSSES, LOST, SCORE, ranking_key
 from coopenv.policies import Agent, Policy, agents_for, find_agent
 from coopenv.policies.loader import CARD_FILES
 from coopenv.runs.console import number_table
@@ -209,6 +210,12 @@ class Evaluation(Contest, Tabular):
         del others[self.reference]
         return {name: compare_paired(own, base, self.block) for name, own in others.items()}
 
+    @property
+    def ranking(self) -> list[str]:
+        """The drivers of the environment as it is, the best first, see `coopenv.evaluation.ranking_key`."""
+        here = [each.name for each in self.entrants if each.scenario is self.entrants[0].scenario]
+        return sorted(here, key=lambda name: ranking_key({r.metric: r.mean for r in self.results[name]}))
+
     def __getitem__(self, driver: str) -> list[Result]:
         """Return the figures of one driver. Raises CoopenvError: it was not evaluated."""
         check_one_of("unknown driver", driver, self.results)
@@ -271,7 +278,8 @@ class Evaluation(Contest, Tabular):
             yield _differences_table(self)
         yield ""
         yield "\n".join(f"{words}: {meaning}." for words, meaning in EXPLANATIONS.items())
-        for name in [each.name for each in self.entrants if each.scenario is self.entrants[0].scenario]:
+        yield f"ranking: {', '.join(self.ranking)}."
+        for name in self.ranking:
             e = self.episodes[name]
             pairs = [(e.vehicles[i], e.vehicles[j], e.seen_share[i, j]) for i, j in np.argwhere(e.seen_share >= 0.01)]
             if pairs:
@@ -301,9 +309,10 @@ COLUMNS = {
 """Metric, its heading, and the factor to the heading's unit."""
 EXPLANATIONS = {
     "intervals": "95 %, bootstrap over worlds",
-    "e50, e95": "median and 95th percentile of the error of vehicles under way, from 3 s on",
-    "score": "e95 [cm] of the fleet, the lower the better",
-    "few": "share of that time with fewer than three targets in view",
+    "e50, e95": "median and 95th percentile of the error from 3 s on, of vehicles under way",
+    "lost": f"collided or never arrived; such vehicles count with {LOST:g} m until the horizon, others with no more",
+    "score": f"e95 [cm] of the fleet; rankings go by losses in steps of {100 * LOSSES:g} %, then by the score",
+    "few": "share of the time from 3 s on with fewer than three targets in view",
     "return": "sum of the rewards of a vehicle",
 }
 """Legend of the tables."""
@@ -445,13 +454,15 @@ def write(evaluation: Evaluation, cards: Iterable[tuple[Entrant, Path]], command
 
 def measured(command: str, worlds: int, block: int, results: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entry of an environment in a card."""
-    return {"command": command, "coopenv": version(), "worlds": worlds, "seed_block": block, "results": results}
+    about = {"command": command, "coopenv": version(), "score": SCORE, "worlds": worlds, "seed_block": block}
+    return {**about, "results": results}
 
 
 def save(folder: Path, description: str, card: Mapping[str, Any]) -> Path:
     """Write a card to an agent's folder, and return the path of the one for people."""
     replace_text(folder / JSON_FILE, json_text(card))
-    text = rendered("card.md.j2", card={"study": None, **card}, description=" ".join(description.split()))
+    old = any(entry.get("score", 1) < SCORE for entry in card["environments"].values())
+    text = rendered("card.md.j2", card={"study": None, **card}, old=old, description=" ".join(description.split()))
     replace_text(folder / TEXT_FILE, text)
     return folder / TEXT_FILE
 

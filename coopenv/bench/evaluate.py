@@ -24,7 +24,7 @@ from coopenv.base.terminal import Terminal
 from coopenv.bench.cards import KINDS, Contest, Evaluation
 from coopenv.evaluation import METRICS, held_out_seeds
 from coopenv.evaluation.episodes import Episodes
-from coopenv.evaluation.metrics import Quantile, interval, resamples
+from coopenv.evaluation.metrics import SCORE, Quantile, interval, resamples
 from coopenv.runs import films
 from coopenv.runs.command import REPLAY_FILE
 from coopenv.runs.console import Progress, compile_notice
@@ -49,6 +49,8 @@ def document(evaluation: Evaluation, command: str) -> dict[str, Any]:
         "overrides": dict(evaluation.overrides),
         "worlds": evaluation.worlds,
         "seed_block": evaluation.block,
+        "score": SCORE,
+        "ranking": evaluation.ranking,
         "metrics": {name: {"unit": metric.unit, "meaning": metric.meaning} for name, metric in METRICS.items()},
         "rows": evaluation.rows,
         "reference": evaluation.reference,

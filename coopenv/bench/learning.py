@@ -5,6 +5,7 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from functools import cache, partial
 from itertools import compress, groupby, product
 from pathlib import Path
@@ -17,7 +18,7 @@ from rich.table import Table
 
 from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
-from coopenv.base.errors import CoopenvError, check_one_of
+from coopenv.base.errors import CoopenvError, check_one_of, listed
 from coopenv.base.files import replace_text
 from coopenv.base.sections import Section, read_toml, validated
 from coopenv.bench import cards
@@ -40,6 +41,8 @@ class StudyFile(Section):
     environments: tuple[Name, ...] = Field(min_length=1)
     arms: tuple[Name, ...] = Field(min_length=1)
     seeds: tuple[Seed, ...] = Field(min_length=1)
+    treatment: tuple[str, ...] = ("scenario.reward.*",)
+    """Patterns of the settings in which the arms may differ."""
 
 
 def agent_of(plan: TrainingPlan) -> str:
@@ -87,13 +90,29 @@ def read_study(path: Path) -> Study:
     """Read a study and the settings that it names.
 
     Raises:
-        CoopenvError: one of the files is not valid; one line that names file and field.
+        CoopenvError: one of the files is not valid, or arms differ in more than their treatment; one line that names
+            file and field.
     """
     file = validated(StudyFile, read_toml(path), str(path))
     groups = list(product(file.environments, file.arms))
     settings = [read_settings(path.parent / file.settings, arm, environment) for environment, arm in groups]
     pairs = list(zip(groups, settings, strict=True))
+    for place, rows in groupby(pairs, lambda pair: pair[0][0]):
+        (first, base), *others = [(arm, _flat(own.model_dump(mode="json"))) for (_, arm), own in rows]
+        for arm, own in others:
+            changed = (key for key in sorted({*base, *own}) if base.get(key) != own.get(key))
+            if extra := [key for key in changed if not any(fnmatchcase(key, pattern) for pattern in file.treatment)]:
+                stated = f"in more than the treatment ({listed(file.treatment)})"
+                raise CoopenvError(f"{path}: arms {first} and {arm} differ in {place} {stated}: {listed(extra, 8)}")
     return Study(tuple(TrainingPlan(place, own, seed, arm) for seed in file.seeds for (place, arm), own in pairs))
+
+
+def _flat(tables: Mapping[str, Any], name: str = "") -> dict[str, Any]:
+    """Return the values of tables within tables by their dotted keys."""
+    found: dict[str, Any] = {}
+    for key, value in tables.items():
+        found |= _flat(value, f"{name}{key}.") if isinstance(value, dict) else {f"{name}{key}": value}
+    return found
 
 
 def is_finished(plan: TrainingPlan, folder: Path) -> bool:

@@ -19,6 +19,7 @@ from coopenv.base.files import check_file, replace_text, replacing_file, writing
 from coopenv.base.format import json_text, number
 from coopenv.base.installation import environment_id, list_envs, version
 from coopenv.bench.cards import OVERVIEW, Contest, cells, rendered
+from coopenv.evaluation.metrics import SCORE
 from coopenv.policies import agents_for
 from coopenv.runs import scenario_text
 from coopenv.runs.films import Shot, space_film, top_view_film, write_film
@@ -160,7 +161,7 @@ def write_figures(
 
         found = contest.drive(report).rows
         rows += [{key: {"sensing": how, **row}[key] for key in KEYS} for row in found if row["metric"] in OVERVIEW]
-    value = {"coopenv": version(), "worlds": worlds, "scenario": fingerprint(scenario), "rows": rows}
+    value = {"coopenv": version(), "score": SCORE, "worlds": worlds, "scenario": fingerprint(scenario), "rows": rows}
     replace_text(folder / f"{Path(environment).stem}.json", json_text(value))
 
 
@@ -176,7 +177,9 @@ def read_value_of_sensing(path: Path) -> dict[str, Any] | None:
         value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         if "text" not in value:
             _rows(value)
-        return {key: value[key] for key in ("coopenv", "worlds", "scenario", "text" if "text" in value else "rows")}
+        return {key: value[key] for key in ("coopenv", "worlds", "scenario", "text" if "text" in value else "rows")} | {
+            "score": value.get("score", 1)
+        }
     except (OSError, ValueError, KeyError, TypeError) as error:
         why = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise CoopenvError(f"{path}: no figures of a page ({why}); --measure makes them anew") from None
@@ -197,6 +200,7 @@ def value_of_sensing_text(environment: str, scenario: Scenario, value: Mapping[s
         drivers=studied(environment, scenario)[0],
         rows=rows,
         worlds=value["worlds"],
+        score=value.get("score", 1),
         coopenv=value["coopenv"],
         changed=changed,
     ).strip()

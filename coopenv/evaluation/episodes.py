@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.base.errors import evaluation_seed, world_keys
-from coopenv.estimation import Sight
+from coopenv.base.errors import CoopenvError, evaluation_seed, world_keys
+from coopenv.estimation import Outcome, Sight
 from coopenv.policies import Policy, decide, restart
 from coopenv.scenario import Scenario
 
+BLOCK_WORLDS, BLOCKS = 2**16, 2**14
+"""Number of worlds of a block of held-out seeds, and of blocks; the seeds after them judge agents while they learn."""
 DIVERGED = 1e9  # m or deg: stands for an error that is not a number
 
 
@@ -47,6 +49,10 @@ class Episodes:
     """(W, N), an `Outcome`, or a condition of the scenario's own; negative: the vehicle was not there."""
     sees: np.ndarray
     """(K, W, N, N) bool: the vehicle measured another driven one in the last frame of the decision."""
+    goal: np.ndarray
+    """(W, N) bool: the vehicle has a goal at which its episode ends."""
+    horizon: int
+    """Number of decisions of an episode that nothing ends sooner."""
 
     @property
     def worlds(self) -> int:
@@ -92,14 +98,35 @@ class Episodes:
         return np.asarray((self.heading + self.pan - way + np.pi) % (2 * np.pi) - np.pi)
 
     @property
+    def lost_from(self) -> np.ndarray:
+        """(W, N) number of decisions after which a vehicle counts as lost until the horizon; `horizon`: never.
+
+        A vehicle is lost after a collision, off its route, and at any other end but an arrival at its goal. While under
+        way, it is lost for that share of the episode which the straight line to its goal is of its route.
+        """
+        failed = np.isin(self.outcome, (Outcome.COLLIDED, Outcome.OFF_ROUTE)) | (self.goal & (self.arrivals[-1] == 0))
+        length = np.linalg.norm(np.diff(self.route, axis=2), axis=-1).sum(axis=-1)
+        left = np.linalg.norm(self.position[-1] - self.route[:, :, -1], axis=-1) / np.maximum(length, 1e-6)
+        slow = len(self.under_way) * (1.0 - np.clip(np.nan_to_num(left), 0.0, 1.0))
+        start = np.where(self.outcome == Outcome.UNDER_WAY, slow, self.under_way.sum(axis=0))
+        return np.where(failed & self.present, start, self.horizon).astype(int)
+
+    @property
     def distance(self) -> np.ndarray:
         """(K, W, N) m that were driven until the end of every decision."""
         return np.asarray(np.cumsum(np.linalg.norm(np.diff(self.position, axis=0), axis=-1), axis=0))
 
 
 def held_out_seeds(block: int, worlds: int) -> list[int]:
-    """Return the seeds of so many worlds that no training has seen; blocks of one size share none."""
-    return [evaluation_seed(block * worlds + world) for world in range(worlds)]
+    """Return the seeds of the first so many worlds of a block; blocks share none, whatever the number of worlds.
+
+    Raises:
+        CoopenvError: there is no such block, or it has fewer worlds.
+    """
+    if not (0 <= block < BLOCKS and 0 <= worlds <= BLOCK_WORLDS):
+        limits = f"seed_block must be below {BLOCKS} and worlds at most {BLOCK_WORLDS}"
+        raise CoopenvError(f"{limits}, got {block} and {worlds}")
+    return [evaluation_seed(block * BLOCK_WORLDS + world) for world in range(worlds)]
 
 
 def driven_vehicles(scenario: Scenario) -> list[int]:
@@ -203,7 +230,8 @@ def drive(
     kept, place, headings, sees = Views(engine, KEPT), [], [], []
     for tick in play(engine, seeds, ticks, policy, False, stride=scenario.ticks_per_decision):
         if tick == 0:
-            route = _routes(view("route")[:, chosen, :, :2], view("route_count")[:, chosen])
+            count = view("route_count")[:, chosen].copy()
+            route = _routes(view("route")[:, chosen, :, :2], count)
         kept.take()
         place.append(view("position")[:, agents, :2].astype(np.float32))
         forward = view("rotation")[:, agents][..., :2, 0]
@@ -222,6 +250,8 @@ def drive(
         route=route,
         outcome=view("ended")[:, chosen].copy(),
         sees=np.stack(sees[1:]),
+        goal=(count > 0) & scenario.termination.arrival,
+        horizon=-(-ticks // scenario.ticks_per_decision),
     )
 
 

@@ -4,7 +4,7 @@ Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 13
 Hinkley, Bootstrap Methods and their Application, 1997, 3.8 (resampling of clusters).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -58,9 +58,9 @@ class Quantile:
         self._share = share
         self.value = float(np.quantile(values, share)) if len(values) else np.nan
         """The figure of all worlds."""
-        edges = np.quantile(values, np.linspace(0.0, 1.0, bins + 1)) if len(values) else np.zeros(2)
-        self._edges = np.unique(edges)
-        some = max(1, len(self._edges) - 1)
+        edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, bins + 1)) if len(values) else np.zeros(2))
+        self._edges = np.append(edges, edges[-1])  # the largest value may be that of many lost vehicles: its own bin
+        some = len(edges)
         place = np.clip(np.searchsorted(self._edges, values, side="right") - 1, 0, some - 1)
         self._seen = np.bincount(world * some + place, minlength=worlds * some).reshape(worlds, some).astype(float)
 
@@ -71,8 +71,6 @@ class Quantile:
 
     def resampled(self, counts: np.ndarray) -> np.ndarray:
         """Return the figure, (R,), for multiplicities of the worlds, (R, W); NaN where none has a value."""
-        if len(self._edges) < 2:
-            return np.where(counts @ self._seen[:, 0] > 0, self.value, np.nan)
         reached = np.cumsum(counts @ self._seen, axis=1)
         wanted = self._share * reached[:, -1:]
         place = np.argmax(reached >= wanted, axis=1)[:, None]
@@ -106,6 +104,12 @@ def interval(values: np.ndarray) -> Interval:
 COLLIDED = Outcome.COLLIDED
 SETTLED_FROM = 3.0
 """Time (s) from which errors count: before it they are the initial estimate's."""
+LOST = 1.0
+"""Position error (m) that counts for a lost vehicle, and for every larger error."""
+LOSSES = 0.02
+"""Step of the share of lost vehicles by which drivers are ranked before their errors."""
+SCORE = 2
+"""Version of e50 and e95, for files: 1, without number, left lost vehicles out."""
 FEW_TARGETS = 3
 """Fewer bearings than these do not determine a pose."""
 
@@ -140,7 +144,32 @@ def _over_moments(counted: np.ndarray, values: np.ndarray, root: bool = False) -
     return Ratio(np.where(counted, values, 0.0).sum(axis=(0, 2)), counted.sum(axis=(0, 2)), root)
 
 
+def scored_errors(
+    episodes: Episodes, start: float = SETTLED_FROM, vehicles: slice = slice(None)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the position errors (M,) that a driver is judged by, m, and the world (M,) of each.
+
+    They are the errors of vehicles under way, at most `LOST`, and `LOST` for every decision in which a vehicle is lost
+    (`Episodes.lost_from`). As a lost vehicle counts until the horizon, no crash lowers a percentile.
+
+    Args:
+        episodes: the record.
+        start: time from which errors count, s.
+        vehicles: the driven vehicles that count.
+    """
+    decisions, (K, *_) = np.arange(episodes.horizon)[:, None, None], episodes.under_way.shape
+    counted = decisions >= episodes.lost_from
+    error = np.full(counted.shape, LOST, episodes.position_error.dtype)
+    error[:K] = np.where(counted[:K], LOST, np.minimum(episodes.position_error, LOST))
+    counted[:K] |= episodes.under_way
+    counted &= episodes.period * (decisions + 1) >= start - 1e-9
+    counted, error = counted[..., vehicles], error[..., vehicles]
+    return error[counted], np.nonzero(counted)[1]
+
+
 def _quantile(name: str, share: float, start: float, episodes: Episodes) -> Statistic:
+    if name == "position_error":
+        return Quantile(*scored_errors(episodes, start), episodes.worlds, share)
     counted = _counted(episodes, start)
     return Quantile(getattr(episodes, name)[counted], np.nonzero(counted)[1], episodes.worlds, share)
 
@@ -151,11 +180,11 @@ def _rmse(name: str, start: float, episodes: Episodes) -> Statistic:
 
 def _errors(quantity: str, unit: str, name: str, prefix: str = "") -> dict[str, Metric]:
     """Return median, 95th percentile and root mean square of an error, from 3 s on and over whole episodes."""
-    found = {}
+    found, lost = {}, f", at most {LOST:g} m, which is that of a lost vehicle" if name == "position_error" else ""
     for when, start in (("", SETTLED_FROM), ("_episode", 0.0)):
         span = f"from {SETTLED_FROM:g} s on" if start else "over the whole episode"
         for short, share, word in (("e50", 0.5, "Median"), ("e95", 0.95, "95th percentile")):
-            meaning = f"{word} of the {quantity} error {span}"
+            meaning = f"{word} of the {quantity} error {span}{lost}"
             found[f"{prefix}{short}{when}_{unit}"] = Metric(meaning, unit, partial(_quantile, name, share, start))
         meaning = f"Root mean square of the {quantity} error {span}"
         found[f"{prefix}rmse{when}_{unit}"] = Metric(meaning, unit, partial(_rmse, name, start))
@@ -176,6 +205,20 @@ METRICS: dict[str, Metric] = {
     "return": Metric("Sum of the rewards of a vehicle", "1", lambda e: _share(e, e.reward.sum(axis=0, dtype=float))),
 }
 """Over vehicle-steps of vehicles under way, or over vehicles; all vehicles of all worlds together."""
+
+
+def ranking_key(figures: Mapping[str, float]) -> tuple[float, float, float]:
+    """Return a key by which drivers are sorted, the best first.
+
+    The losses come first, in steps of `LOSSES`: the share of vehicles that do not arrive, plus the share of those that
+    collide. Drivers on one step are sorted by e95, and by e50 where e95 is that of lost vehicles for both.
+
+    Args:
+        figures: values of `METRICS` by name.
+    """
+    losses = 1.0 - figures["arrival_rate"] + figures["collision_rate"]
+    e95, e50 = (float(np.nan_to_num(figures[name], nan=np.inf)) for name in ("e95_m", "e50_m"))
+    return float(np.floor(losses / LOSSES + 1e-9)), e95, e50
 
 
 @dataclass(frozen=True)

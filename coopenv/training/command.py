@@ -26,12 +26,12 @@ from coopenv.backends.sources import open_simulation
 from coopenv.base import interrupts
 from coopenv.base.errors import CoopenvError, OutputError, evaluation_seed
 from coopenv.base.files import check_file, new_folder, replacing_file, replacing_folder, writing
-from coopenv.evaluation import Result, drive, held_out_seeds, score
+from coopenv.evaluation import Result, drive, held_out_seeds, ranking_key, score
 from coopenv.policies import Policy, load_agent
 from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE
 from coopenv.scenario import Scenario
 from coopenv.training.export import EXPORTED, check_onnx, export
-from coopenv.training.ranking import Figures, Ranking, figures_of, ranking_key
+from coopenv.training.ranking import Figures, Ranking, figures_of
 from coopenv.training.sets import SetTrainer
 from coopenv.training.settings import TrainingPlan, check_settings, environment_file
 from coopenv.training.trainer import Arrays, DivergedError, Status, Trainer, tensors_of

@@ -1,16 +1,12 @@
 """The rank of a policy among other drivers in the same held-out worlds, and what it lacks."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from coopenv.evaluation import Result
+from coopenv.evaluation import Result, ranking_key
 
 Figures = dict[str, float]
 """Figures of a driver by the names of `METRICS`."""
-LOSSES = 0.02
-"""Step of the share of lost vehicles by which drivers are ranked before their errors."""
 ENOUGH = 0.98
 """Share of arrivals from which on none are named as missing."""
 
@@ -18,12 +14,6 @@ ENOUGH = 0.98
 def figures_of(results: Sequence[Result]) -> Figures:
     """Return the figures of a driver."""
     return {result.metric: result.mean for result in results}
-
-
-def ranking_key(figures: Mapping[str, float]) -> tuple[float, float]:
-    """Return a key by which drivers are sorted, the best first: losses in steps of `LOSSES`, then e95."""
-    losses = 1.0 - figures["arrival_rate"] + figures["collision_rate"]
-    return float(np.floor(losses / LOSSES + 1e-9)), float(np.nan_to_num(figures["e95_m"], nan=np.inf))
 
 
 @dataclass(frozen=True)

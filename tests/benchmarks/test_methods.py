@@ -124,9 +124,17 @@ def test_results_come_back_from_their_file(tmp_path: Path) -> None:
         study.read_results(tmp_path / "results.csv", runs)
 
 
-def test_runs_that_arrive_are_better_and_then_those_with_less_error() -> None:
-    figures = [(0.2, 0.1), (0.89, 0.1), (0.9, 0.9), (1.0, 0.5), (0.95, 0.2)]
-    ranks = [study.rank({"arrival_rate": arrived, "e95_m": e95}) for arrived, e95 in figures]
+def test_runs_with_fewer_losses_are_better_and_then_those_with_less_error() -> None:
+    figures = [
+        (0.2, 0.8, 0.1),
+        (0.2, 0.3, 0.1),
+        (0.81, 0.18, 0.106),
+        (0.96, 0.0, 0.21),
+        (1.0, 0.0, 0.9),
+        (1.0, 0.0, 0.5),
+    ]
+    names = ("arrival_rate", "collision_rate", "e95_m")
+    ranks = [study.rank({"e50_m": 0.1, **dict(zip(names, each, strict=True))}) for each in figures]
     assert ranks == sorted(ranks)
 
 

@@ -6,16 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import coopenv
 from coopenv.api.engine import Engine
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation import Outcome
-from coopenv.evaluation import METRICS, Episodes, compare_paired, drive, held_out_seeds, score
-from coopenv.evaluation.metrics import Quantile, Ratio, interval, resamples
+from coopenv.evaluation import METRICS, Episodes, compare_paired, drive, held_out_seeds, ranking_key, score
+from coopenv.evaluation.episodes import BLOCK_WORLDS, BLOCKS
+from coopenv.evaluation.metrics import LOST, Quantile, Ratio, interval, resamples, scored_errors
 from coopenv.policies import load_agent
 from coopenv.policies.base import zero_policy
 from coopenv.runs import rollout
 from tests.helpers.four_way import FOUR_WAY
+from tests.helpers.trips import trips
 
 SCENARIO = coopenv.load_scenario(FOUR_WAY, {"horizon": 16.0})
 
@@ -92,9 +97,16 @@ def test_an_error_that_is_no_number_counts_as_a_huge_one(monkeypatch: pytest.Mon
     assert (found.position_error > 1e8).all() and (found.orientation_error < 1e3).all()
 
 
-def test_held_out_seeds_are_shared_by_no_two_blocks() -> None:
-    seeds = [seed for block in range(3) for seed in held_out_seeds(block, 5)]
-    assert len(set(seeds)) == 15 and min(seeds) >= 2**31
+def test_no_two_blocks_share_a_seed_whatever_the_number_of_worlds() -> None:
+    few, many = [{*held_out_seeds(block, 3)} for block in range(1, 90)], {*held_out_seeds(0, 256)}
+    assert many == {*range(2**31, 2**31 + 256)}  # those of the figures on cards
+    assert all(not many & block for block in few) and len(set().union(*few)) == 3 * 89
+    last = held_out_seeds(BLOCKS - 1, BLOCK_WORLDS)
+    assert min(last) > max(held_out_seeds(BLOCKS - 2, BLOCK_WORLDS)) and max(last) in coopenv.EVALUATION_SEEDS
+    assert max(last) < coopenv.evaluation_seed(2**30)  # from here on, seeds judge agents while they learn
+    for block, worlds in ((BLOCKS, 1), (0, BLOCK_WORLDS + 1)):
+        with pytest.raises(CoopenvError, match="seed_block must be below 16384 and worlds at most 65536"):
+            held_out_seeds(block, worlds)
 
 
 def test_vehicles_that_are_not_there_do_not_count(episodes: Episodes) -> None:
@@ -119,7 +131,7 @@ def test_looking_counts_from_the_nearest_piece_of_the_route() -> None:
     position = np.array([[0.0, 0.0], [1.0, 0.3], [4.2, 2.0], [3.9, 6.0]])[:, None, None]
     heading = np.array([0.3, np.pi / 2 - 0.4, -np.pi])[:, None, None]
     none = np.zeros((3, 1, 1))
-    found = Episodes(("a",), 0.1, *(none,) * 5, position, heading, none, route, none, none[0], none)
+    found = Episodes(("a",), 0.1, *(none,) * 5, position, heading, none, route, none, none[0], none, none[0] > 0, 3)
     np.testing.assert_allclose(found.looking[:, 0, 0], [0.3, -0.4, np.pi / 2], atol=1e-12)
     panned = replace(found, pan=np.array([0.2, -0.3, np.pi])[:, None, None])  # the camera, not the car, says where
     np.testing.assert_allclose(panned.looking[:, 0, 0], [0.5, -0.7, -np.pi / 2], atol=1e-12)
@@ -185,3 +197,73 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
         low, high = interval(Ratio(values.sum(axis=0), np.full(40, 25.0)).resampled(counts))
         held += low <= 0.0 <= high
     assert 0.89 <= held / 300 <= 0.99
+
+
+def figures(episodes: Episodes) -> dict[str, float]:
+    return {name: metric.of(episodes).value for name, metric in METRICS.items()}
+
+
+def test_a_driver_that_crashes_in_18_percent_ranks_behind_one_that_never_does() -> None:
+    """Both as measured in open_square: 81 % arrive with an e95 of 11 cm, against 96 % with 21 cm."""
+    crashing = trips([0.106] * 100, np.arange(100) >= 18, np.where(np.arange(100) < 18, 16, 40))
+    careful = trips([0.21] * 100, np.arange(100) >= 4, np.where(np.arange(100) < 4, 80, 40), speed=0.45)
+    bad, good = figures(crashing), figures(careful)
+    assert bad["e95_m"] == LOST and good["e95_m"] == pytest.approx(0.21)
+    assert ranking_key(good) < ranking_key(bad)
+
+
+@given(st.data())
+@settings(max_examples=60, deadline=None)
+def test_a_crash_in_place_of_an_arrival_never_improves_the_score(data: st.DataObject) -> None:
+    W = data.draw(st.integers(1, 6))
+    errors = data.draw(st.lists(st.floats(0.0, 3.0), min_size=W, max_size=W))
+    arrived = np.array([True, *data.draw(st.lists(st.booleans(), min_size=W - 1, max_size=W - 1))])
+    ended = np.array(data.draw(st.lists(st.integers(1, 79), min_size=W, max_size=W)))
+    before = figures(trips(errors, arrived, ended))
+    crash = np.where(np.arange(W) == 0, data.draw(st.integers(1, int(ended[0]))), ended)
+    after = figures(trips(errors, arrived & (np.arange(W) > 0), crash))
+    for name in ("e50_m", "e95_m", "e50_episode_m", "e95_episode_m"):
+        assert np.isnan(before[name]) or after[name] >= before[name] - 1e-12, name
+    assert ranking_key(before) <= ranking_key(after)
+
+
+def test_an_early_crash_weighs_more_than_a_late_one() -> None:
+    early, late = (trips([0.1] * 20, np.arange(20) > 0, np.where(np.arange(20) > 0, 76, end)) for end in (5, 75))
+    assert early.lost_from[0, 0] == 5 and late.lost_from[0, 0] == 75 and (early.lost_from[1:] == early.horizon).all()
+    lost = [np.mean(scored_errors(driven)[0] == LOST) for driven in (early, late)]
+    assert lost == pytest.approx([75 / (75 + 19 * 71), 5 / (75 + 19 * 71)])
+
+
+def test_a_vehicle_that_has_not_arrived_at_the_horizon_is_lost_for_the_rest_of_its_route() -> None:
+    standing = trips([0.1], np.array([False]), np.array([80]), speed=0.125)  # 5 of 20 m
+    assert standing.lost_from[0, 0] == 20
+    values, _ = scored_errors(standing, start=0.0)
+    assert len(values) == 80 and (values == LOST).sum() == 60
+    aimless = replace(standing, goal=np.zeros((1, 1), dtype=bool))
+    assert aimless.lost_from[0, 0] == 80 and figures(aimless)["e95_m"] == pytest.approx(0.1)
+    collided = trips([0.1], np.array([False]), np.array([30]))
+    assert replace(collided, goal=np.zeros((1, 1), dtype=bool)).lost_from[0, 0] == 30
+    assert replace(collided, outcome=-collided.outcome).lost_from[0, 0] == 80  # never there
+
+
+def test_the_interval_of_lost_vehicles_is_theirs() -> None:
+    values, world = np.append(np.linspace(0.0, 0.2, 900), np.full(100, LOST)), np.tile(np.arange(10), 100)
+    found = Quantile(values, world, 10, 0.95)
+    assert found.value == LOST and interval(found.resampled(resamples(10, 0))) == (LOST, LOST)
+
+
+def test_losses_are_ranked_before_errors_and_errors_within_a_step() -> None:
+    def driver(arrived: float, collided: float, e95: float, e50: float = 0.1) -> dict[str, float]:
+        return {"arrival_rate": arrived, "collision_rate": collided, "e95_m": e95, "e50_m": e50}
+
+    ordered = [
+        driver(1.0, 0.0, 0.1),
+        driver(0.99, 0.0, 0.2),
+        driver(0.96, 0.0, 0.21),
+        driver(0.97, 0.03, 0.05),  # of as many that do not arrive, the ones that crash come last
+        driver(0.81, 0.18, 0.106),
+        driver(0.0, 1.0, 1.0, 0.8),
+        driver(0.0, 1.0, 1.0, 0.9),
+    ]
+    assert sorted(reversed(ordered), key=ranking_key) == ordered
+    assert ranking_key(driver(1.0, 0.0, float("nan"))) > ranking_key(ordered[0])

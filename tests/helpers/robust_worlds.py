@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coopenv.api.engine import Engine
-from coopenv.evaluation import held_out_seeds
+from coopenv.base.errors import evaluation_seed
 from coopenv.observers import Recording
 from coopenv.policies import decide, find_agent, restart
 from coopenv.runs.recorder import record
@@ -141,7 +141,7 @@ def watched(
 def steps_of(agent: str, scenario: Scenario, worlds: int, seed: int) -> Iterator[Engine]:
     """Yield the engine after every decision of an agent, until all episodes are over."""
     engine, policy = Engine(scenario, worlds), find_agent(agent).policy(scenario)
-    engine.reset(held_out_seeds(seed, worlds))
+    engine.reset([evaluation_seed(seed * worlds + world) for world in range(worlds)])
     actions, observed = engine.world.actions.numpy(), engine.view("observation")
     restart(policy, np.ones(engine.view("alive").size, dtype=bool))
     while not engine.view("over").all():

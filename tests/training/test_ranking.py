@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from coopenv.training.ranking import Ranking, ranking_key
+from coopenv.evaluation import ranking_key
+from coopenv.training.ranking import Ranking
 
 
 def driver(arrived: float, collided: float, e95: float) -> dict[str, float]:
-    return {"arrival_rate": arrived, "collision_rate": collided, "e95_m": e95, "rmse_m": e95}
+    return {"arrival_rate": arrived, "collision_rate": collided, "e95_m": e95, "e50_m": e95}
 
 
 SAFE, EXACT = driver(0.99, 0.0, 0.21), driver(0.77, 0.2, 0.09)

@@ -107,11 +107,10 @@ def test_settings_that_changed_train_anew_what_was_interrupted(tmp_path: Path) -
 
 def test_what_cannot_be_trained_is_reported_before_anything_is(tmp_path: Path) -> None:
     (tmp_path / "train.toml").write_text(
-        SETTINGS
-        + '[environments.open_square.arms.plain]\nscenario.observation.exclude = ["map"]\nclone.agent = "peek"\n'
+        SETTINGS + '[environments.open_square]\nscenario.observation.exclude = ["map"]\nclone.agent = "peek"\n'
     )
     process = start(COMMAND, tmp_path)
     _, errors = process.communicate(timeout=100)
     assert process.returncode == 2
-    assert "open_square_plain/seed_1: agent 'peek' cannot be built: the observation lacks map_position" in errors
+    assert "open_square_quality/seed_1: agent 'peek' cannot be built: the observation lacks map_position" in errors
     assert not list(tmp_path.glob("open_square_*"))

@@ -10,6 +10,7 @@ from weakref import ref
 import pytest
 
 from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import data_directory
 from coopenv.bench.learning import Judge, Study, place_of, read_study
 from coopenv.evaluation import Difference, Episodes, Result, compare_paired, drive, score
 
@@ -18,6 +19,7 @@ settings = "train.toml"
 environments = ["open_square", "facade"]
 arms = ["quality", "plain"]
 seeds = [1, 7]
+treatment = ["scenario.reward.*", "ppo.gamma"]
 """
 SETTINGS = """
 steps = 1000
@@ -52,6 +54,27 @@ def test_arms_differ_in_what_they_say(study: Study) -> None:
     assert quality.settings.steps == plain.settings.steps == 1000
 
 
+@pytest.mark.parametrize(
+    "change",
+    ["steps = 2000", 'clone.agent = "peek"', "ppo.hidden = [8]", "randomised.randomisation.camera_range = [0.5, 1.0]"],
+)
+def test_arms_that_differ_in_more_than_the_reward_are_refused(change: str, tmp_path: Path) -> None:
+    (tmp_path / "train.toml").write_text(f"steps = 1000\n[arms.quality]\n{change}\n[arms.plain]\n")
+    (tmp_path / "study.toml").write_text(STUDY.replace("treatment", "# "))
+    with pytest.raises(CoopenvError, match="differ in open_square .*: " + change.split(" ")[0].replace(".", r"\.")):
+        read_study(tmp_path / "study.toml")
+    (tmp_path / "study.toml").write_text(STUDY.replace('["quality", "plain"]', '["quality"]'))
+    assert len(read_study(tmp_path / "study.toml").plans) == 4  # a single arm is compared with none
+
+
+def test_the_shipped_studies_compare_like_with_like() -> None:
+    agents = data_directory("agents")
+    assert {plan.arm for plan in read_study(agents / "study.toml").plans} == {"quality"}
+    reward = read_study(agents / "reward_study.toml")
+    first, *others = [plans[0].settings.model_dump() for plans in reward.agents.values()]
+    assert [each | {"scenario": {}} for each in others] == [first | {"scenario": {}}] * len(others) and others
+
+
 def test_parts(study: Study) -> None:
     assert [place_of(plan) for plan in study.only(["facade", "7", "plain"]).plans] == [Path("facade_plain/seed_7")]
     assert len(study.only(["quality"]).plans) == 4
@@ -70,6 +93,15 @@ def test_parts(study: Study) -> None:
         (STUDY.replace("[1, 7]", "[-1]"), r"study\.toml: seeds"),
         (STUDY + "sedes = 1\n", r"study\.toml: .*sedes"),
         ("settings =", r"study\.toml: not valid TOML"),
+        (
+            STUDY.replace('"scenario.reward.*", ', ""),
+            r"study\.toml: arms quality and plain differ in open_square in more than the treatment \(ppo\.gamma\): "
+            r"scenario\.reward\.weights\.position_uncertainty$",
+        ),
+        (
+            STUDY.replace('treatment = ["scenario.reward.*", "ppo.gamma"]\n', ""),
+            r"\(scenario\.reward\.\*\): ppo\.gamma$",
+        ),
     ],
 )
 def test_mistakes_are_one_line(text: str, message: str, tmp_path: Path) -> None:
