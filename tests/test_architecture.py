@@ -92,24 +92,24 @@ def test_a_class_name_means_one_class() -> None:
 
 LINES_AND_FILES = {
     ".": (129, 2),
-    "api": (4118, 16),
+    "api": (4126, 16),
     "backends": (4079, 15),
-    "base": (2125, 10),
-    "bench": (5554, 18),
+    "base": (2341, 12),
+    "bench": (5780, 19),
     "cars": (12039, 48),
-    "cli": (2746, 9),
-    "estimation": (1917, 7),
-    "evaluation": (492, 3),
-    "observers": (11661, 42),
-    "policies": (2081, 10),
-    "runs": (3610, 13),
-    "scenario": (3983, 13),
-    "training": (1587, 6),
-    "viz": (4887, 16),
+    "cli": (2749, 9),
+    "estimation": (1922, 7),
+    "evaluation": (575, 3),
+    "observers": (11835, 43),
+    "policies": (2121, 10),
+    "runs": (3658, 13),
+    "scenario": (3987, 13),
+    "training": (1797, 7),
+    "viz": (4947, 17),
     "world": (5634, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
-MOST_FILES = 246
+MOST_FILES = 252
 
 
 def test_wings_keep_their_budgets() -> None:
