@@ -20,7 +20,7 @@ from coopenv.cli import options
 from tests.helpers.four_way import FOUR_WAY
 
 HEAVY = {"warp", "scipy", "numba", "matplotlib", "PIL", "pandas", "mcap", "torch", "joblib", "jinja2"}
-LIGHT = {f"base.{name}" for name in ("errors", "installation", "interrupts")}
+LIGHT = {f"base.{name}" for name in ("errors", "installation", "interrupts", "plugins")}
 LIGHT |= {"base", "api", "api.registration"}
 COMMANDS = Path(coopenv.__file__).parent / "cli"
 LIGHT |= {"cli", *(f"cli.{path.stem}" for path in COMMANDS.glob("[a-z]*.py"))}

@@ -73,11 +73,14 @@ class DescribeOptions(options.SourceOptions):
 @options.command
 def describe(given: DescribeOptions) -> None:
     """Print a summary of an environment: vehicles, sensors, observer."""
-    from coopenv.backends.sources import is_recorded, simulation_of
+    from coopenv.backends.registry import ENVIRONMENT, kind_of
+    from coopenv.backends.sources import simulation_of
     from coopenv.runs.summary import describe_scenario, document, summary
 
     name = Path(given.environment).stem
-    if is_recorded(given.environment) or any((given.data, given.variant, given.topics, given.selection.given)):
+    if kind_of(given.environment) is not ENVIRONMENT or any(
+        (given.data, given.variant, given.topics, given.selection.given)
+    ):
         backend = given.open()
         scenario, recorded = backend.scenario, backend.capabilities.recorded
     else:

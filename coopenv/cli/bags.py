@@ -63,8 +63,8 @@ def import_(
             replace_text(propose, text)
             console.print(f"{propose}: set its environment and markers", soft_wrap=True)
         return
-    from coopenv.backends.sources import open_bags
     from coopenv.base.files import check_new
+    from coopenv.cars.bags.bag import open_bags
 
     if out is not None:
         check_log(out, observer, scene)
@@ -128,8 +128,10 @@ def calibrate(
     as_json: options.AsJson = False,
 ) -> None:
     """Estimate cameras, odometry, clocks and markers of cars from one drive, and print which constants are wrong."""
-    from coopenv.backends.sources import SourceKind, kind_of, open_bags, open_recording
+    from coopenv.backends.registry import kind_of
+    from coopenv.backends.sources import open_recording
     from coopenv.base.files import check_file, new_folder, replace_text
+    from coopenv.cars.bags.bag import open_bags
     from coopenv.cars.calibration import calibrate as calibrated
     from coopenv.cars.calibration import toml_text
     from coopenv.cars.calibration_drives import drive_of_bag, drive_of_recording
@@ -143,7 +145,7 @@ def calibrate(
             drive = drive_of_bag(open_bags(bags, topics, options.parse_overrides(overrides)))
         elif overrides:
             raise CoopenvError("--override: needs the map of the bags' topics, --map topics.toml")
-        elif len(bags) > 1 or kind_of(bags[0]) is not SourceKind.LOG:
+        elif len(bags) > 1 or not kind_of(bags[0]).reader:
             raise CoopenvError(f"{bags[0]}: needs the map of its topics, --map topics.toml; a log of coopenv does not")
         else:
             drive = drive_of_recording(open_recording(bags[0]), bags[0])
@@ -185,8 +187,8 @@ def identify(
     A deployment file takes the result as `identified`. The second table compares the bag with fakes that get the same
     commands: Kolmogorov-Smirnov distances, 0 to 1, for the environment as it is, for the result, and by chance.
     """
-    from coopenv.backends.sources import open_bags
     from coopenv.base.files import check_file, replace_text
+    from coopenv.cars.bags.bag import open_bags
     from coopenv.cars.identify import identify as identified
     from coopenv.cars.identify import toml_text
     from coopenv.runs.console import Progress, number_table

@@ -123,7 +123,7 @@ class ObserverOptions:
 
     def plan(self) -> "Plan":
         """Return the comparison, everything in it checked."""
-        from coopenv.backends.sources import Selection
+        from coopenv.backends.selection import Selection
         from coopenv.bench.observers.comparison import SEEDS, Plan
         from coopenv.bench.observers.sources import find_source
 

@@ -32,13 +32,13 @@ from coopenv.base.errors import (
     shown,
     suggest,
 )
-from coopenv.base.installation import SCENES, is_scene, list_agents, list_envs, scenario_path
+from coopenv.base.installation import BAGS, SCENES, is_scene, list_agents, list_envs, scenario_path
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from coopenv.backends.base import Backend
-    from coopenv.backends.sources import Selection
+    from coopenv.backends.selection import Selection
 
 PLAIN = ("zero", "random")
 """Policies without an agent."""
@@ -84,11 +84,11 @@ def existing(what: str) -> Callable[[Any], Any]:
 
 def known_environment(name: str | None) -> str | None:
     """Return the name of an environment, a file or a recording. Raises CoopenvError: there is none."""
-    from coopenv.backends.sources import BAG_SUFFIXES, LOG_SUFFIX, is_recorded
+    from coopenv.backends.registry import ENVIRONMENT, LOG_SUFFIX, kind_of
 
-    if name is not None and name.endswith((*BAG_SUFFIXES, LOG_SUFFIX)):
+    if name is not None and name.endswith((*BAGS, LOG_SUFFIX)):
         existing("log" if name.endswith(LOG_SUFFIX) else "bag")(name)
-    if name is not None and not (os.path.exists(name) or is_scene(name) or is_recorded(name)):  # noqa: PTH110 (never raises)
+    if name is not None and not os.path.exists(name) and kind_of(name) is ENVIRONMENT and not is_scene(name):  # noqa: PTH110 (never raises)
         for kind, names in (("agent", list_agents()), ("observer", observer_names())):
             if name in names:
                 raise CoopenvError(f"expected an environment, {name} is an {kind}: coopenv list, coopenv list {kind}s")
@@ -399,7 +399,7 @@ class SourceOptions:
     @property
     def selection(self) -> Selection:
         """The part of recorded data that is used."""
-        from coopenv.backends.sources import Selection
+        from coopenv.backends.selection import Selection
 
         return Selection.of(self.start, self.until, self.robots)
 

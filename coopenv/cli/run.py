@@ -142,10 +142,11 @@ def refuse_for_recordings(environment: str, seed: int, policy: str) -> None:
 
     Of a bag the initial estimates may be drawn.
     """
-    from coopenv.backends.sources import is_bag, is_recorded
+    from coopenv.backends.registry import kind_of
 
-    for option, value in (("--seed", 0 if is_bag(environment) else seed), ("--policy", policy)):
-        if is_recorded(environment) and value not in (0, "zero"):
+    kind = kind_of(environment)
+    for option, value in (("--seed", seed if kind.reader else 0), ("--policy", policy)):
+        if kind.recorded and value not in (0, "zero"):
             raise CoopenvError(f"{option}: is for a simulation, {environment} is recorded")
 
 
@@ -168,7 +169,8 @@ def record(given: RecordOptions) -> None:
 
     The file holds every tick; coopenv replays it, Foxglove and Lichtblick show it with the estimates of an observer.
     """
-    from coopenv.backends.sources import is_bag, is_recorded, open_recording
+    from coopenv.backends.registry import kind_of
+    from coopenv.backends.sources import open_recording
     from coopenv.base.files import check_new
     from coopenv.runs.console import Progress
     from coopenv.runs.recorder import record as recorded
@@ -189,9 +191,8 @@ def record(given: RecordOptions) -> None:
     check_log(out, observer, given.scene)
     for path in (out, *([] if given.no_replay else [page])):
         check_new(path, given.force)
-    bag = is_bag(environment, given.topics)
-    replayed = is_recorded(environment) and not bag
-    if not bag and given.topics is not None:
+    kind = kind_of(environment, given.topics)
+    if given.topics is not None and "topics" not in kind.options:
         raise CoopenvError(f"--map {given.topics}: is for ROS bags, {environment} is none")
     refuse_for_recordings(environment, given.seed, given.policy)
     log, keepers = options.console(stderr=True), list[Keeper]()
@@ -201,7 +202,7 @@ def record(given: RecordOptions) -> None:
             keepers.append(Keeper(engine, source_of(engine, out.name, given.seed, given.policy)))
         keepers[0].tick(tick)
 
-    if replayed:
+    if kind.reader:
         if given.changes:
             raise CoopenvError(f"--override: is for a simulation, {environment} is recorded")
         recording = open_recording(environment, given.data, given.variant, given.selection)

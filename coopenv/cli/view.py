@@ -57,10 +57,10 @@ class SceneOptions(options.SourceOptions):
         Raises:
             CoopenvError: there is no such source, or an option is not for it.
         """
-        from coopenv.backends.sources import is_bag, is_recorded
+        from coopenv.backends.registry import kind_of
         from coopenv.runs.scenes import open_source
 
-        if self.agent is not None and (is_recorded(self.environment) or is_bag(self.environment, self.topics)):
+        if self.agent is not None and kind_of(self.environment, self.topics).recorded:
             raise CoopenvError(f"--agent: is for a simulation, {self.environment} is recorded")
         changes = {**self.changes, **(more or {})}
         observer = (more or {}).get("observer.name", self.observer)
@@ -235,11 +235,11 @@ class ViewOptions(SceneOptions):
         """Return the source of ticks, cars included."""
         if self.environment != CARS or self.deployment is None:
             return super().open(more)
-        from coopenv.cars.backend.backend import open_svea
+        from coopenv.backends.sources import open_backend
 
         watching = {} if self.observer is None else {"observer.name": self.observer}
         changes = {**self.changes, **watching, **(more or {})}
-        return open_svea(self.deployment, None, changes, connect=self.connect, watch=True)
+        return open_backend(self.deployment, CARS, changes, options={"connect": self.connect, "watch": True})
 
     def reel(self) -> "Reel":
         """Return the source of frames; cars are observed and not driven.

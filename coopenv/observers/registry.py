@@ -12,14 +12,14 @@ import ast
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from coopenv.base.errors import CoopenvError, ScenarioError, error_text, shown, suggest
+from coopenv.base.errors import CoopenvError, ScenarioError, shown, suggest
 from coopenv.base.installation import absolute_reference, check_reference, install_command, is_reference, load_reference
+from coopenv.base.plugins import loaded, offered
 
 if TYPE_CHECKING:
     from coopenv.observers.contract import Factory
@@ -165,13 +165,9 @@ def portable(name: str) -> str | Factory:
     return _places.get(name) or (name if row is None else row.factory or row.embedded)
 
 
-def _installed() -> dict[str, EntryPoint]:
-    return {point.name: point for point in entry_points(group=GROUP)}
-
-
 def list_observers() -> list[str]:
     """Return every known name, without classes and import paths that were merely used."""
-    return sorted({*ZOO, *_listed & _registered.keys(), *_installed()})
+    return sorted({*ZOO, *_listed & _registered.keys(), *offered(GROUP)})
 
 
 def states_covariance(name: str) -> bool:
@@ -284,10 +280,4 @@ def _found(observer: str | Factory) -> RegisteredObserver:
     if observer in _registered:
         return _registered[observer]
     check_known(observer)
-    point = _installed()[observer]
-    try:
-        return _row(point.load())
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # foreign code
-        raise CoopenvError(f"observer '{observer}' ({point.value}) cannot be loaded: {error_text(error)}") from error
+    return _row(loaded(offered(GROUP)[observer], "observer"))

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console, ConsoleOptions, RenderResult
 
 from coopenv.backends.base import Repeating
-from coopenv.backends.sources import Selection, open_backend, source_name
+from coopenv.backends.selection import Selection
+from coopenv.backends.sources import open_backend, source_name
 from coopenv.base.columns import WIDTH, Columns, Tabular, one_line, picture_html, terminal_html
 from coopenv.base.errors import CoopenvError, DataError, checked_seed, explained, listed
 from coopenv.base.files import new_folder, replace_text, replacing_folder

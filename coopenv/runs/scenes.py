@@ -16,7 +16,9 @@ from rich.console import Console
 from coopenv.api.engine import Engine
 from coopenv.backends.base import Backend
 from coopenv.backends.mcap import write_recording
-from coopenv.backends.sources import WHOLE, Selection, SourceKind, kind_of, open_backend
+from coopenv.backends.registry import kind_of
+from coopenv.backends.selection import WHOLE, Selection
+from coopenv.backends.sources import open_backend
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, list_envs
 from coopenv.evaluation.episodes import play
@@ -183,7 +185,7 @@ def open_source(
 def title_of(name: str) -> str:
     """Return the name of a source in headings."""
     path = Path(name)
-    return path.name if kind_of(name) in (SourceKind.LOG, SourceKind.BAG) else path.stem
+    return path.name if kind_of(name).recorded else path.stem
 
 
 def write_page(record: SceneRecord, path: Path, log: Console, others: Mapping[str, str] | None = None) -> Path | None:

@@ -15,7 +15,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import coopenv
 from coopenv import CoopenvError, DataError
 from coopenv.backends.mcap import write_recording
-from coopenv.backends.sources import Selection, is_recording, open_recording
+from coopenv.backends.selection import Selection
+from coopenv.backends.sources import is_recording, open_recording
 from coopenv.base.errors import DataWarning
 from coopenv.bench.observers import compare
 from coopenv.cars.bags.topic_map import load_map

@@ -368,11 +368,9 @@ def test_observers_that_were_merely_used_are_known_and_not_listed(monkeypatch: p
 def test_observers_of_installed_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     from importlib.metadata import EntryPoint
 
-    points = [
-        EntryPoint("theirs", f"{__name__}:Probe", "coopenv.observers"),
-        EntryPoint("broken", "no_such_module:Thing", "coopenv.observers"),
-    ]
-    monkeypatch.setattr(registry, "entry_points", lambda group: points if group == "coopenv.observers" else [])
+    group, places = "coopenv.observers", {"theirs": f"{__name__}:Probe", "broken": "no_such_module:Thing"}
+    points = {name: EntryPoint(name, place, group) for name, place in places.items()}
+    monkeypatch.setattr(registry, "offered", lambda asked: points if asked == group else {})
     assert find("theirs") is Probe
     with pytest.raises(CoopenvError, match=r"'broken'.*cannot be loaded.*no_such_module"):
         find("broken")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
-from coopenv.backends.sources import Selection
+from coopenv.backends.selection import Selection
 from coopenv.base.columns import Columns, Tabular, one_line, picture_html, terminal_html, written
 from coopenv.base.errors import CoopenvError, DataWarning, check_one_of, checked_seed, explained
 from coopenv.base.installation import names_of

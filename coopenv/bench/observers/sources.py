@@ -17,18 +17,11 @@ import numpy as np
 
 from coopenv.backends.base import Backend
 from coopenv.backends.mrclam_dataset import IN_SPACE
-from coopenv.backends.sources import (
-    OBJECT,
-    WHOLE,
-    Selection,
-    SourceKind,
-    is_bag,
-    is_recording,
-    kind_of,
-    open_backend,
-    open_recording,
-)
+from coopenv.backends.registry import ENVIRONMENT, kind_of
+from coopenv.backends.selection import WHOLE, Selection
+from coopenv.backends.sources import OBJECT, is_recording, open_backend, open_recording
 from coopenv.base.errors import CoopenvError, DataWarning, suggest
+from coopenv.base.plugins import call
 from coopenv.bench.observers.changes import NO_FOLLOWERS, leaders_of
 from coopenv.bench.observers.faults import (
     NOMINAL,
@@ -314,9 +307,8 @@ def find_source(
         for option in [option for option, value in options.items() if value]:
             raise CoopenvError(f"{option}: is for names of environments or files, a Recording was given")
         return GivenRecord(OBJECT, selection.applied(text, OBJECT), added=added)
-    sort = kind_of(text)
-    bag = is_bag(text, topics)
-    if sort is SourceKind.ENVIRONMENT and not bag and topics is None and data is None:
+    kind = kind_of(text, topics)
+    if kind is ENVIRONMENT and topics is None and data is None:
         for option, value in selection.given.items():
             raise CoopenvError(f"--{option} {value}: is for recorded data, {scenario_name(text)} is simulated")
         scenario = load_scenario(text, overrides)
@@ -326,26 +318,30 @@ def find_source(
                 raise CoopenvError(f"--policy {policy}: no vehicle of this environment is driven")
             load_policy(policy, scenario, 0)
         return SimulatedRecords(scenario_name(text), scenario, policy or "zero", added=worlds)
-    robots, path = sort is SourceKind.DATASET, Path(str(text))
+    ticks = kind is not ENVIRONMENT and not kind.reader
+    path = Path(str(text))
     folder, topic_map = (None if given is None else Path(given) for given in (data, topics))
     refused = {
         f"--policy {policy}: {text} is recorded, its vehicles cannot be driven": policy is not None,
         f"--fault {next(iter(faults), '')}: recorded robots have variants of their own, {', '.join(Robots.named)}": (
-            robots and faults
+            kind.comparison and faults
         ),
-        f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9": data and not robots,
-        f"--map {topics}: is for ROS bags, {text} is none": topics and not bag,
+        f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9": data and not kind.comparison,
+        f"--map {topics}: is for ROS bags, {text} is none": topics and "topics" not in kind.options,
         f"--override {next(iter(overrides or ()), '')}: {text} is recorded, and compared as it is": (
-            overrides and not bag
+            overrides and not ticks
         ),
-        f"no such log file: {text}": not (bag or robots or path.is_file()),
+        f"no such log file: {text}": not (ticks or kind.comparison or path.is_file()),
     }
     for reason, holds in refused.items():
         if holds:
             raise CoopenvError(reason)
-    if bag:
+    if ticks:
         return Bags(path.stem, path, topic_map, dict(overrides or {}), selection, added=added)
-    return Robots(str(text), folder, selection) if robots else LogFile(path.stem, path, selection, added=added)
+    if kind.comparison:
+        made: RecordSource = call(kind.comparison, f"source '{text}'", str(text), folder, selection)
+        return made
+    return LogFile(path.stem, path, selection, added=added)
 
 
 def variants_of(source: RecordSource, asked: str | Iterable[str] | None) -> tuple[str, ...]:

@@ -371,6 +371,17 @@ def open_svea(
     return Svea(deployment, binding, link, signer, verifier, recorder)
 
 
+def open_cars(name: str, overrides: Mapping[str, Any], deployment: str | Path | None = None, **options: Any) -> Svea:
+    """Return the cars of a deployment file: the given one, or `name` itself.
+
+    Raises:
+        CoopenvError: there is no deployment, or as for `open_svea`, which has the options.
+    """
+    if deployment is None and not str(name).endswith(".toml"):
+        raise CoopenvError(f"deployment: needed by backend='svea': the file with the cars that drive {name}")
+    return open_svea(deployment or name, None if deployment is None else name, overrides, **options)
+
+
 def scenario_of(deployment: Deployment, environment: str | None, overrides: Mapping[str, Any]) -> Scenario:
     """Return the environment of a deployment.
 

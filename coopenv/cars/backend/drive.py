@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
-from coopenv.backends.mcap_format import CUT_OFF, RosLog, codec, metadata_names, reading
+from coopenv.backends.mcap_format import CUT_OFF, RosLog, codec, reading
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, OutputError
 from coopenv.base.files import writing
 from coopenv.base.installation import install_command, version
@@ -27,13 +27,13 @@ from coopenv.cars.backend.station import refusal
 from coopenv.cars.codec import STOPPED, TICK, decode, encode, header, make, stamp_of
 from coopenv.cars.deployment import Deployment, parse_deployment
 from coopenv.cars.profile import STOPPED_TOPIC, TICK_TOPIC, presence_of
+from coopenv.cars.source import DRIVE_METADATA
 from coopenv.cars.transport import Arrival, Transport
 from coopenv.scenario import parse_scenario
 from coopenv.scenario.files import override
 from coopenv.scenario.own_terms import without_own_terms
 
 FORMAT = "coopenv drive 1"
-NAME = "coopenv-drive"
 ATTACHMENT = "drive.json"
 MARKS = {TICK_TOPIC: TICK, STOPPED_TOPIC: STOPPED}
 """Types of the messages of ticks and stops, by topic."""
@@ -72,7 +72,7 @@ class DriveRecorder:
             self._stream = path.open("xb")
             self._log = RosLog(self._stream)
             self._writer = self._log.writer
-            self._writer.add_metadata(NAME, {"format": FORMAT, "version": version()})
+            self._writer.add_metadata(DRIVE_METADATA, {"format": FORMAT, "version": version()})
             self._writer.add_attachment(0, 0, ATTACHMENT, "application/json", head)
             self._stream.flush()
         encode(make(STOPPED))  # the first message of a type takes long, and this one must not
@@ -153,11 +153,6 @@ def head_of(deployment: Deployment, binding: Binding, only: str | None) -> bytes
     return json.dumps(head).encode()
 
 
-def is_drive(path: str | Path) -> bool:
-    """Return whether a file is a recorded drive; False where it cannot be read."""
-    return NAME in (metadata_names(path) or ())
-
-
 class Drive(TickGenerator):
     """A drive as a backend: actions change nothing. Every reset goes on to its next episode, and round again.
 
@@ -187,7 +182,7 @@ class Drive(TickGenerator):
         nothing = f"{path}: {f'{CUT_OFF}, and ' if container.cut_off else ''}no episode begins in it"
         if container.cut_off and ATTACHMENT not in attachments:
             raise DataError(nothing)
-        if metadata.get(NAME, {}).get("format") != FORMAT or ATTACHMENT not in attachments:
+        if metadata.get(DRIVE_METADATA, {}).get("format") != FORMAT or ATTACHMENT not in attachments:
             raise DataError(f"{path}: no recorded drive of coopenv (format '{FORMAT}')")
         self._deployment, self.binding = self._read_head(attachments[ATTACHMENT], overrides or {})
         with reading(self._where):

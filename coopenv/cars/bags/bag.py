@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
+from coopenv.backends.selection import WHOLE, Selection
 from coopenv.backends.worlds import without_robots
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning, check_one_of, listed
 from coopenv.cars.backend.assembler import Assembler
@@ -216,3 +217,29 @@ class Bag(TickGenerator):
 def _used(sample: Sample) -> int:
     """Return when a sample is put in, ns."""
     return sample.stamp - AHEAD if sample.role is Role.TRUTH else sample.stamp
+
+
+def open_bag(
+    name: str | Path,
+    overrides: Mapping[str, Any] | None = None,
+    topics: str | Path | None = None,
+    selection: Selection = WHOLE,
+) -> Bag:
+    """Return a ROS bag as a backend; arguments and errors as for `coopenv.backends.sources.open_backend`."""
+    return open_bags([name], topics, overrides, selection)
+
+
+def open_bags(
+    names: Sequence[str | Path],
+    topics: str | Path | None,
+    overrides: Mapping[str, Any] | None = None,
+    selection: Selection = WHOLE,
+) -> Bag:
+    """Return ROS bags of one drive as a backend; arguments and errors as for `open_bag`."""
+    where = ", ".join(str(name) for name in names)
+    missing = [str(name) for name in names if not Path(name).exists()]
+    if missing:
+        raise DataError(f"no such bag: {', '.join(missing)}")
+    if topics is None:
+        raise DataError(f"{where}: a ROS bag, which needs a map of its topics, --map topics.toml (see docs/bags.md)")
+    return Bag(names, topics, overrides, selection.start or 0.0, selection.until, selection.robots)

@@ -240,7 +240,8 @@ def test_what_cannot_be_compared_is_left_out_with_its_reason(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A variant that a single vehicle cannot have, and a package's observer that cannot be loaded."""
-    monkeypatch.setattr(registry, "entry_points", lambda group: [EntryPoint("broken", "no_such_module:Thing", group)])
+    broken = {"broken": EntryPoint("broken", "no_such_module:Thing", "coopenv.observers")}
+    monkeypatch.setattr(registry, "offered", lambda group: broken)
     short = ["--set", "horizon=0.1", "--seeds", "1", "--jobs", "1"]
     assert main(["bench", "observers", "crossing_path", "--variants", "all", *short]) == 0
     both = capsys.readouterr()

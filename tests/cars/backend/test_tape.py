@@ -25,11 +25,13 @@ from rosbags.highlevel import AnyReader
 import coopenv
 from coopenv.backends.base import Command
 from coopenv.backends.mcap import read_recording
+from coopenv.backends.registry import kind_of
 from coopenv.base.errors import DataError, DataWarning, OutputError
-from coopenv.cars.backend.drive import PRESENCE, Drive, DriveRecorder, RecordedTransport, is_drive
+from coopenv.cars.backend.drive import PRESENCE, Drive, DriveRecorder, RecordedTransport
 from coopenv.cars.codec import MOST_BYTES, TICK, encode, header, make
 from coopenv.cars.fake.lockstep import Hub
 from coopenv.cars.profile import STOPPED_TOPIC, SVEA, TICK_TOPIC, Role, presence_of
+from coopenv.cars.source import DRIVE
 from coopenv.runs.command import execute, report
 from coopenv.runs.demo import links_report
 from coopenv.runs.rollouts import Rollout
@@ -297,7 +299,7 @@ def test_of_a_drive_that_is_cut_off_what_is_whole_is_replayed(recorded: Any, tmp
     for size in np.linspace(4000, len(data) - 1, 8).astype(int).tolist():
         path = tmp_path / f"{size}.mcap"
         path.write_bytes(data[:size])
-        assert is_drive(path)
+        assert kind_of(path) is DRIVE
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:

@@ -20,7 +20,7 @@ from numpy.testing import assert_allclose
 from coopenv import CoopenvError, DataError
 from coopenv.backends import mcap_container as container
 from coopenv.backends.mcap_format import metadata_names
-from coopenv.backends.sources import SourceKind, is_bag, kind_of
+from coopenv.backends.registry import ENVIRONMENT, LOG, kind_of
 from coopenv.base.errors import DataWarning
 from coopenv.cars import codec
 from coopenv.cars.bags import files, streams
@@ -29,6 +29,7 @@ from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TopicMapError, load_map
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import Detections, Twist
+from coopenv.cars.source import BAG
 from coopenv.cli.app import main
 from coopenv.estimation.poses import exp_so3
 from coopenv.scenario import load_scenario
@@ -267,12 +268,12 @@ def test_files_of_other_programs_are_distinguished(
     foreign, text = tmp_path / "foreign.mcap", tmp_path / "text.mcap"
     shutil.copy(written["mcap"], foreign)
     assert metadata_names(foreign) == frozenset()
-    assert kind_of(foreign) is kind_of(written["mcap"].parent) is SourceKind.BAG
+    assert kind_of(foreign) is kind_of(written["mcap"].parent) is BAG
     assert main(["run", str(foreign)]) == 2
     assert "foreign.mcap: a ROS bag, which needs a map" in capsys.readouterr().err
     text.write_bytes(b"no log")
-    assert metadata_names(text) is None and kind_of(text) is SourceKind.LOG
-    assert is_bag(text, "topics.toml") and not is_bag("a\0b") and not is_bag("crossing_path")
+    assert metadata_names(text) is None and kind_of(text) is LOG
+    assert kind_of(text, "topics.toml") is BAG and ENVIRONMENT is kind_of("a\0b") is kind_of("crossing_path")
 
 
 def test_the_camera_publishes_its_own_calibration(tmp_path: Path) -> None:

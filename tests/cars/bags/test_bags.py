@@ -16,7 +16,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import coopenv
 from coopenv import CoopenvError, DataError
 from coopenv.backends.mcap import read_recording
-from coopenv.backends.sources import SourceKind, kind_of, open_backend, open_recording
+from coopenv.backends.registry import LOG, kind_of
+from coopenv.backends.sources import open_backend, open_recording
 from coopenv.base.errors import DataWarning
 from coopenv.bench.observers import sources
 from coopenv.cars import codec
@@ -24,6 +25,7 @@ from coopenv.cars.backend.drive import DriveRecorder
 from coopenv.cars.bags.bag import Bag
 from coopenv.cars.bags.log import Shift, reconcile, recorders
 from coopenv.cars.bags.topics import regularity
+from coopenv.cars.source import BAG, DRIVE
 from coopenv.cli.app import main
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Sensed
@@ -77,7 +79,7 @@ def assert_same(first: list[Sensed], second: list[Sensed], atol: float = 0.0) ->
 
 @pytest.mark.parametrize("name", ["ros1.bag", "sqlite3", "sqlite3/sqlite3.db3", "mcap", "mcap/mcap.mcap"])
 def test_ticks_are_those_of_the_drive_from_folders_and_from_bare_files(name: str, folder: Path) -> None:
-    assert kind_of(folder / name) is SourceKind.BAG
+    assert kind_of(folder / name) is BAG
     made, bag = bags.drive(), Bag([folder / name], folder / "topics.toml")
     ticks = ticks_of(bag)
     assert len(ticks) == bag.capabilities.ticks == made.ticks - 1  # the first frame is before tick 0
@@ -108,7 +110,7 @@ def test_an_imported_bag_is_a_recording(folder: Path, capsys: pytest.CaptureFixt
     assert main(line) == 0
     printed = capsys.readouterr().out
     assert "/agent8/pixy_node/objectsInfo" in printed and "svea3 detections" in printed and "240 ticks" in printed
-    assert kind_of(out) is SourceKind.LOG
+    assert kind_of(out) is LOG
     recording, direct = read_recording(out), record(Bag([folder / "sqlite3"], given))
     for name in ("rotation", "translation", "bearings", "visible", "start_position"):
         assert_array_equal(getattr(recording, name), getattr(direct, name))
@@ -325,7 +327,7 @@ def test_a_tape_of_cars_is_a_bag_too(folder: Path, tmp_path: Path, reference: li
     for m in drive:
         recorder.write(names[m.topic], codec.encode(bags.made(m)), bags.BEGIN + m.received)
     recorder.close()
-    assert kind_of(path) is SourceKind.LOG  # which is replayed as it was
+    assert kind_of(path) is DRIVE  # which is replayed as it was
     text = bags.MAP.replace('"authors"', '"svea"') + '[cars.topics]\npoint = "/fleet/svea1/point"\n'
     assert_same(ticks_of(open_bag(path, tmp_path, text)), reference)
 

@@ -1,0 +1,155 @@
+"""The table of sources: kinds of names that give ticks, of this package, of its guests and of installed packages.
+
+A package offers its own kind under the entry point group `coopenv.sources`, as a `SourceKind`. A name is looked up in
+the table before any of the simulation is loaded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coopenv.base.errors import CoopenvError, check_one_of, shown
+from coopenv.base.installation import is_scene, list_envs
+from coopenv.base.plugins import call, loaded, offered
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+    from coopenv.backends.base import Backend
+    from coopenv.backends.selection import Selection
+    from coopenv.observers.recording import Recording
+    from coopenv.scenario import ScenarioLike
+
+GROUP = "coopenv.sources"
+
+LOG_SUFFIX = ".mcap"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceKind:
+    """A kind of source; places are `module:name` and load on first use."""
+
+    title: str
+    """Continues the sentence "NAME is ..."."""
+    opener: str = ""
+    """Function of a name and overrides, and of the `options` by name, that returns the backend."""
+    claims: Callable[[str, str | Path | None], bool] | None = None
+    """Whether a name, with this map of topics, is of the kind; None: the name of the entry point, also NAME:DETAILS."""
+    options: tuple[str, ...] = ()
+    """Arguments of `open_backend` that the opener takes, `selection` among them; others are refused."""
+    recorded: bool = False
+    """True if its ticks are recorded; otherwise the name of the entry point is one for the option `backend`, too."""
+    reader: str = ""
+    """Function of a name, the folder `data` and a `variant` that returns a `Recording`; empty: it gives only ticks."""
+    conversion: str = "coopenv record {} --out FILE.mcap"
+    """Command that makes a recording of a name whose kind has no reader."""
+    example: str = ""
+    """Names for which the reader is."""
+    comparison: str = ""
+    """Its `coopenv.bench.observers.sources.RecordSource`, made of name, `data` and selection; empty: the usual one."""
+    simulation: str = ""
+    """Backend, made of the scenario, of environments whose key `sensing` is the name of the entry point."""
+
+    def open(
+        self, name: ScenarioLike, overrides: Mapping[str, Any], given: Mapping[str, Any], selection: Selection
+    ) -> Backend:
+        """Return the backend of a name; options are `given` by name, None where they are not.
+
+        Raises:
+            CoopenvError: an option is not for this kind, or it cannot be opened.
+        """
+        options = {option: value for option, value in given.items() if value is not None}
+        if selection.given:
+            options["selection"] = selection
+        for option in [option for option in options if option not in self.options]:
+            first = next(iter(selection.given)) if option == "selection" else option
+            raise CoopenvError(f"{first} is for {self._readers(option)}, '{name}' is {self.title}")
+        backend: Backend = call(self.opener, f"source '{name}'", name, overrides, **options)
+        return backend
+
+    def _readers(self, option: str) -> str:
+        if option in ("data", "variant", "selection"):
+            return "recorded data" if option == "selection" or not self.recorded else "recorded data sets"
+        if option == "topics":
+            return "ROS bags"
+        return " or ".join(f"backend='{name}'" for name, kind in kinds().items() if option in kind.options)
+
+
+LOG = SourceKind(
+    title="an MCAP file",
+    opener="coopenv.backends.sources:replay_of",
+    claims=lambda name, topics: name.endswith(LOG_SUFFIX),
+    options=("data", "variant", "selection"),
+    recorded=True,
+    reader="coopenv.backends.sources:read_log",
+    example=f"FILE{LOG_SUFFIX}",
+)
+ENVIRONMENT = SourceKind(title="simulated", opener="coopenv.backends.sources:open_environment", options=("backend",))
+"""Whatever no other kind claims: an environment by name, file, scene or dict."""
+
+
+def no_name(name: str, topics: str | Path | None) -> bool:
+    """Claim no name: the kind is opened with the option `backend` only."""
+    return False
+
+
+def kind_named(name: str) -> SourceKind:
+    """Return the kind of an entry point. Raises CoopenvError: there is none, or it cannot be loaded."""
+    points = offered(GROUP)
+    check_one_of("unknown source", name, points)
+    return _kind(points[name])
+
+
+def _kind(point: EntryPoint) -> SourceKind:
+    kind = loaded(point, "source")
+    if not isinstance(kind, SourceKind):
+        raise CoopenvError(f"source '{point.name}' ({point.value}): expected a SourceKind, got {shown(kind)}")
+    return kind
+
+
+def kinds() -> dict[str, SourceKind]:
+    """Return the kinds of guests and installed packages by name, without those that cannot be loaded."""
+    found = {}
+    for name, point in offered(GROUP).items():
+        try:
+            found[name] = _kind(point)
+        except CoopenvError:  # an error for those who name it
+            continue
+    return found
+
+
+def live_kind(name: str, others: Mapping[str, SourceKind]) -> SourceKind:
+    """Return the kind that a name of the option `backend` denotes, one of the others included.
+
+    Raises:
+        CoopenvError: there is none, or it cannot be loaded.
+    """
+    if name in offered(GROUP) and name not in others:
+        kind_named(name)  # raises if it cannot be loaded
+    live = {entry: kind for entry, kind in kinds().items() if kind.opener and not kind.recorded}
+    known = {**others, **live, **others}
+    check_one_of("unknown backend", name, known)
+    return known[name]
+
+
+def kind_of(name: ScenarioLike | Recording, topics: str | Path | None = None) -> SourceKind:
+    """Return the kind of source of a name, which need not exist; `topics` is the map of a bag's topics.
+
+    A folder that is called like an environment is ./NAME, unless a map is given.
+
+    Raises:
+        CoopenvError: it is the name of a kind that cannot be loaded.
+    """
+    text = str(name)
+    if not isinstance(name, str | Path) or (topics is None and (text in list_envs() or is_scene(text))):
+        return ENVIRONMENT
+    entry = text.partition(":")[0]
+    if (point := offered(GROUP).get(entry)) and _kind(point).claims is None:
+        return _kind(point)
+    for kind in (*kinds().values(), LOG):
+        if kind.claims is not None and kind.claims(text, topics):
+            return kind
+    return ENVIRONMENT

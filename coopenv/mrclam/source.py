@@ -1,0 +1,41 @@
+"""MR.CLAM as a kind of source: `mrclam_1` .. `mrclam_9`, with `_space` for observers in space."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from coopenv.backends.registry import SourceKind
+
+if TYPE_CHECKING:
+    from coopenv.observers.recording import Recording
+
+NAMES = re.compile(r"mrclam_\d+(_space)?")
+
+
+def is_dataset(name: str, topics: str | Path | None) -> bool:
+    """Return whether a name is that of a sub-dataset, be there one of that number or not."""
+    return NAMES.fullmatch(name) is not None
+
+
+def read(name: str | Path, data: str | Path | None, variant: str | None) -> Recording:
+    """Return a sub-dataset; arguments and errors as for `coopenv.backends.sources.open_recording`."""
+    from coopenv.backends.mrclam import check_variant, load_dataset, recording_of
+    from coopenv.backends.mrclam_dataset import IN_SPACE
+
+    chosen = check_variant(variant or "landmarks+robots")  # before much is read
+    in_space = str(name).endswith(IN_SPACE)
+    return recording_of(load_dataset(str(name).removesuffix(IN_SPACE), data), chosen, in_space)
+
+
+MRCLAM = SourceKind(
+    title="a sub-dataset of MR.CLAM",
+    opener="coopenv.backends.sources:replay_of",
+    claims=is_dataset,
+    options=("data", "variant", "selection"),
+    recorded=True,
+    reader="coopenv.mrclam.source:read",
+    example="mrclam_1 .. mrclam_9",
+    comparison="coopenv.bench.observers.sources:Robots",
+)
