@@ -7,10 +7,9 @@ from pkgutil import resolve_name
 
 from coopenv.bench.pages import bullets, table
 from coopenv.observers.kernel_observer import KernelObserver
-from coopenv.observers.registry import ZOO, ZooEntry
+from coopenv.observers.registry import ZooEntry, zoo
 from sitegen.mirror import ROOT, relinked
 
-PACKAGE = "coopenv.observers"
 TABLE = "docs/observers.md"
 MORE = {
     "riccati": "../../method.md",
@@ -29,9 +28,9 @@ An observer estimates the pose of one vehicle. [Comparing observers](../../obser
 def observers() -> Iterator[tuple[str, str]]:
     """Yield path and Markdown text of the pages of all observers, and of the one that lists them."""
     known = _rows()
-    rows = [(f"[`{name}`]({name}_.md)", *known[name]) for name in ZOO]
+    rows = [(f"[`{name}`]({name}_.md)", *known[name]) for name in zoo()]
     yield "reference/observers/index.md", HEAD + table(("name", "what it is", "sends"), rows) + "\n"
-    for name, entry in ZOO.items():
+    for name, entry in zoo().items():
         yield f"reference/observers/{name}_.md", _page(name, entry, *known[name])
 
 
@@ -39,7 +38,7 @@ def _rows() -> dict[str, tuple[str, str]]:
     """Return what the table in docs/observers.md says of every observer: what it is, what it sends."""
     text = relinked((ROOT / TABLE).read_text(encoding="utf-8"), TABLE, "reference/observers/index.md")
     found = re.findall(r"^\| `(\w+)` \| (.+) \| (.+) \|$", text.partition("## The zoo")[2], re.MULTILINE)
-    return {name: (about, sends) for name, about, sends in found if name in ZOO}
+    return {name: (about, sends) for name, about, sends in found if name in zoo()}
 
 
 def _docstring(file: str) -> str:
@@ -48,7 +47,7 @@ def _docstring(file: str) -> str:
 
 def _class(entry: ZooEntry) -> object:
     """Return the class or function of an observer, None for one that needs an extra."""
-    return None if entry.needs else resolve_name(f"{PACKAGE}.{entry.plugin}")
+    return None if entry.needs else resolve_name(f"{entry.package}.{entry.plugin}")
 
 
 def _where(entry: ZooEntry) -> str:
@@ -63,7 +62,7 @@ def _where(entry: ZooEntry) -> str:
 
 def _page(name: str, entry: ZooEntry, about: str, sends: str) -> str:
     place, _, item = entry.plugin.partition(":")
-    module = f"coopenv/observers/{place.replace('.', '/')}"
+    module = f"{entry.package}.{place}".replace(".", "/")
     file = f"{module}.py" if (ROOT / f"{module}.py").exists() else f"{module}/__init__.py"
     facts = [
         f"Sends: {sends}.",
@@ -87,7 +86,7 @@ def _page(name: str, entry: ZooEntry, about: str, sends: str) -> str:
                 *([f"[More]({MORE[name]})."] if name in MORE else []),
                 *shown,
                 "## Code",
-                f"::: {PACKAGE}.{place}.{item}",
+                f"::: {entry.package}.{place}.{item}",
             ]
         )
         + "\n"

@@ -6,13 +6,13 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 
 from coopenv.base.installation import list_agents, list_envs
-from coopenv.observers.registry import ZOO
+from coopenv.observers.registry import zoo
 from sitegen.mirror import ROOT, examples_page, page_of, relinked
 from sitegen.observers import observers
 
 LISTED: dict[str, Callable[[], list[dict[str, str]]]] = {
     "environments/README.md": lambda: [{name: f"environments/{name}.md"} for name in list_envs()],
-    "reference/observers/index.md": lambda: [{name: f"reference/observers/{name}_.md"} for name in sorted(ZOO)],
+    "reference/observers/index.md": lambda: [{name: f"reference/observers/{name}_.md"} for name in sorted(zoo())],
     "reference/agents/index.md": lambda: [{name: page_of(f"agents/{name}/card.md")} for name in list_agents()],
 }
 """Pages that the navigation lists below another one."""

@@ -17,7 +17,6 @@ ROOMS = (
     ("world",),
     ("observers",),
     ("backends",),
-    ("mrclam",),
     ("cars",),
     ("viz",),
     ("api",),
@@ -26,6 +25,7 @@ ROOMS = (
     ("training",),
     ("runs",),
     ("bench",),
+    ("mrclam",),
     ("cli", "__init__"),
     ("__main__",),
 )

@@ -25,11 +25,11 @@ import pytest
 
 from coopenv import CoopenvError, load_scenario
 from coopenv.backends.mcap import read_recording, write_recording
-from coopenv.backends.mrclam_dataset import load_dataset
 from coopenv.base.format import read_npz
 from coopenv.base.sections import read_toml
 from coopenv.cars.bags.topic_map import load_map
 from coopenv.cars.deployment import load_deployment
+from coopenv.mrclam.dataset import load_dataset
 from coopenv.observers import Recording
 from coopenv.observers.contract import SensorNoise
 from coopenv.policies.loader import read_card

@@ -13,9 +13,9 @@ import numpy as np
 from benchmarks.options import status_of
 from benchmarks.planar.changes import blindfolded, changed, clocks, drifting, hidden, misread, odometry, part
 from benchmarks.planar.lies import Drifting, Replaying
-from coopenv.backends.mrclam import VARIANTS, Dataset, load_dataset, recording_of
 from coopenv.estimation.poses import Array
-from coopenv.observers.planar import LEAST_LOST_STD, PlanarEkf, PlanarRobust
+from coopenv.mrclam.planar import LEAST_LOST_STD, PlanarEkf, PlanarRobust
+from coopenv.mrclam.recording import VARIANTS, Dataset, load_dataset, recording_of
 from coopenv.observers.recording import Recording
 from coopenv.observers.runner import Run, run
 from tests.helpers.mrclam_files import barrier_robots, carried_off

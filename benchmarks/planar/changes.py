@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from coopenv.backends.mrclam_dataset import Dataset, MotionCapture, Robot
 from coopenv.estimation.poses import Array
+from coopenv.mrclam.dataset import Dataset, MotionCapture, Robot
 
 LANDMARKS_FROM = 6  # subjects below that are robots
 Change = Callable[[Robot, np.random.Generator], Robot]

@@ -21,8 +21,8 @@ def is_dataset(name: str, topics: str | Path | None) -> bool:
 
 def read(name: str | Path, data: str | Path | None, variant: str | None) -> Recording:
     """Return a sub-dataset; arguments and errors as for `coopenv.backends.sources.open_recording`."""
-    from coopenv.backends.mrclam import check_variant, load_dataset, recording_of
-    from coopenv.backends.mrclam_dataset import IN_SPACE
+    from coopenv.mrclam.dataset import IN_SPACE
+    from coopenv.mrclam.recording import check_variant, load_dataset, recording_of
 
     chosen = check_variant(variant or "landmarks+robots")  # before much is read
     in_space = str(name).endswith(IN_SPACE)
@@ -37,5 +37,5 @@ MRCLAM = SourceKind(
     recorded=True,
     reader="coopenv.mrclam.source:read",
     example="mrclam_1 .. mrclam_9",
-    comparison="coopenv.bench.observers.sources:Robots",
+    comparison="coopenv.mrclam.comparison:Robots",
 )

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from coopenv.base.errors import CoopenvError, ScenarioError, shown, suggest
 from coopenv.base.installation import absolute_reference, check_reference, install_command, is_reference, load_reference
-from coopenv.base.plugins import loaded, offered
+from coopenv.base.plugins import loaded, offered, own
 
 if TYPE_CHECKING:
     from coopenv.observers.contract import Factory
@@ -37,6 +37,7 @@ class ZooEntry:
     on_a_plane: bool = True
     """True if it is meant for robots on a plane whose odometry is their commands (`Setup.planar`)."""
     covariance: bool = True  # whether its P is meant as a covariance, and is no matrix of gains
+    package: str = "coopenv.observers"  # of its modules
 
 
 ZOO = {
@@ -58,8 +59,6 @@ ZOO = {
     "distributed_invariant": ZooEntry("covariance_intersection:DistributedInvariant"),
     "ukf": ZooEntry("pose_filters:Ukf"),
     "factor_graph": ZooEntry("factor_graph:FactorGraph", needs="gtsam"),
-    "planar_ekf": ZooEntry("planar:PlanarEkf", in_space=False),
-    "planar_robust": ZooEntry("planar:PlanarRobust", in_space=False),
     "robust": ZooEntry("robust.observer:robust", "robust.observer:ROBUST", on_a_plane=False),
     "centralised": ZooEntry("centralised:Centralised"),
     "first_estimates_ekf": ZooEntry("centralised:FirstEstimatesEkf"),
@@ -68,12 +67,17 @@ ZOO = {
     "smoother": ZooEntry("smoother:Smoother", on_a_plane=False),
     "fixed_lag_smoother": ZooEntry("smoother:FixedLagSmoother", on_a_plane=False),
 }
-"""Observers of coopenv, by name."""
+"""Observers of this package by name; `zoo` has those of coopenv's guests, too."""
 
 
 GROUP = "coopenv.observers"
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
+
+
+def zoo() -> dict[str, ZooEntry]:
+    """Return the observers of coopenv by name; guests offer theirs as entry points."""
+    return ZOO | {name: loaded(point, "observer") for name, point in own(GROUP).items()}
 
 
 class RegisteredObserver(NamedTuple):
@@ -108,7 +112,7 @@ def register(name: str, factory: Factory | None = None, *, embedded: Embedded | 
     if (factory is None and embedded is None) or (embedded is not None and not _has_kernels(embedded)):
         raise CoopenvError(f"observer '{name}': expected a class, a function or an Embedded, got {shown(embedded)}")
     row = RegisteredObserver(factory, embedded)
-    if name in ZOO or _registered.get(name, row) != row:
+    if name in zoo() or _registered.get(name, row) != row:
         raise CoopenvError(f"an observer named '{name}' exists already")
     _registered[name] = row
     _listed.add(name)
@@ -167,26 +171,28 @@ def portable(name: str) -> str | Factory:
 
 def list_observers() -> list[str]:
     """Return every known name, without classes and import paths that were merely used."""
-    return sorted({*ZOO, *_listed & _registered.keys(), *offered(GROUP)})
+    return sorted({*zoo(), *_listed & _registered.keys(), *offered(GROUP)})
 
 
 def states_covariance(name: str) -> bool:
     """Return whether an observer's P is meant as a covariance: of the paper's observer it is a matrix of gains."""
-    return name not in ZOO or ZOO[name].covariance
+    row = zoo().get(name)
+    return row is None or row.covariance
 
 
 def description(name: str) -> str:
     """Return the description of a known observer in one line, or why it cannot be used here."""
     if reason := obstacle(name):
         return reason
-    text = _docstring(ZOO[name].plugin) if name in ZOO else find(name).__doc__
+    row = zoo().get(name)
+    text = _docstring(row) if row else find(name).__doc__
     return " ".join((text or "").split()).partition(". ")[0].rstrip(".")
 
 
-def _docstring(place: str) -> str | None:
+def _docstring(row: ZooEntry) -> str | None:
     """Return the docstring of a class or function of this package from the source: loading it may take seconds."""
-    module, _, name = place.partition(":")
-    spec = find_spec(f"coopenv.observers.{module}")
+    module, _, name = row.plugin.partition(":")
+    spec = find_spec(f"{row.package}.{module}")
     source = Path(str(spec and spec.origin)).read_text(encoding="utf-8")
     kinds = ast.ClassDef | ast.FunctionDef
     [found] = [node for node in ast.parse(source).body if isinstance(node, kinds) and node.name == name]
@@ -216,8 +222,8 @@ def check_known(name: str) -> None:
 
 def obstacle(name: str) -> str:
     """Return why a known observer cannot be used here, in one line; empty where it can."""
-    if name in ZOO:
-        module = ZOO[name].needs
+    if row := zoo().get(name):
+        module = row.needs
         return f"needs {module}: {install_command('bench')}" if module and find_spec(module) is None else ""
     if name not in _registered:
         try:
@@ -230,7 +236,7 @@ def obstacle(name: str) -> str:
 def available_names(planar: bool | None = None) -> list[str]:
     """Return the names that can be used here; `planar`: only those for robots on a plane, or for vehicles in space."""
     both = planar is None
-    strangers = {name for name, row in ZOO.items() if not (both or (row.on_a_plane if planar else row.in_space))}
+    strangers = {name for name, row in zoo().items() if not (both or (row.on_a_plane if planar else row.in_space))}
     names = sorted({*list_observers(), *_registered})
     return [name for name in names if name not in strangers and not obstacle(name)]
 
@@ -241,10 +247,11 @@ def find(name: str | Factory) -> Factory:
     Raises:
         CoopenvError: unknown name, a missing dependency, an import that fails, or no factory.
     """
-    if isinstance(name, str) and name in ZOO:
-        if reason := obstacle(name):
+    known = zoo().get(name) if isinstance(name, str) else None
+    if known:
+        if reason := obstacle(str(name)):
             raise CoopenvError(f"observer '{name}' {reason}")
-        return _attribute(ZOO[name].plugin)
+        return _attribute(known.plugin, known.package)
     row = _found(name)
     return row.factory or _attribute("kernel_observer:KernelFactory")(row.embedded)
 
@@ -254,14 +261,14 @@ def find_embedded(name: str, planar: bool = False) -> Embedded | None:
 
     `planar` is for robots on a plane whose odometry is their commands.
     """
-    if name not in ZOO:
+    row = zoo().get(name)
+    if row is None:
         return _found(name).embedded
-    row = ZOO[name]
-    return _attribute(row.kernels) if row.kernels and (row.on_a_plane or not planar) else None
+    return _attribute(row.kernels, row.package) if row.kernels and (row.on_a_plane or not planar) else None
 
 
-def _attribute(place: str) -> Any:
-    return resolve_name(f"{__package__}.{place}")
+def _attribute(place: str, package: str = __package__) -> Any:
+    return resolve_name(f"{package}.{place}")
 
 
 def _loaded(reference: str) -> Any:

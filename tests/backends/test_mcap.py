@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from coopenv import DataError
 from coopenv.backends.mcap import read_recording, write_recording
-from coopenv.backends.mrclam import load_dataset, recording_of
 from coopenv.cli.app import main
+from coopenv.mrclam.recording import load_dataset, recording_of
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Truth
 from tests.helpers import mrclam_files

@@ -23,9 +23,9 @@ from coopenv.api.engine import Engine
 from coopenv.api.parallel_env import CooperativeLocalisationEnv as Env
 from coopenv.backends.base import Backend, Command
 from coopenv.backends.mcap import read_recording, write_recording
-from coopenv.backends.mrclam import load_dataset, recording_of
 from coopenv.backends.tick_world import TickWorld, open_world
 from coopenv.backends.worlds import Replay, Simulated
+from coopenv.mrclam.recording import load_dataset, recording_of
 from coopenv.observers import Recording, run
 from coopenv.runs import record
 from coopenv.scenario import Scenario

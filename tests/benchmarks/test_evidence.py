@@ -17,8 +17,8 @@ from benchmarks.planar.__main__ import main
 from benchmarks.planar.changes import blindfolded, changed, clocks, drifting, hidden, misread, odometry, part
 from benchmarks.planar.lies import Drifting, Replaying
 from benchmarks.stages import robust_stages
-from coopenv.backends.mrclam import recording_of
 from coopenv.bench.observers.faults import variant_of
+from coopenv.mrclam.recording import recording_of
 from coopenv.observers import run
 from coopenv.observers.contract import Message
 from coopenv.observers.recording import Recording

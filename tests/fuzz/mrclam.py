@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
-from coopenv.backends.mrclam import VARIANTS, load_dataset, recording_of
 from coopenv.backends.worlds import Replay
+from coopenv.mrclam.recording import VARIANTS, load_dataset, recording_of
 from coopenv.observers import Recording
 from tests.fuzz.harness import go_through, taken
 from tests.helpers import mrclam_files

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from coopenv.backends.mrclam import Dataset, recording_of
-from coopenv.backends.mrclam_dataset import MotionCapture, Robot
+from coopenv.mrclam.dataset import MotionCapture, Robot
+from coopenv.mrclam.recording import Dataset, recording_of
 from coopenv.observers.recording import PER_TICK, Recording
 
 ORIGIN = 1248444187.0

@@ -36,7 +36,7 @@ from tests.helpers.recordings import simulated as recording
 from tests.helpers.sessions import ROOT, blocks
 from tests.oracles.batch import small_errors
 
-NAMES = sorted({*registry.ZOO} & {*registry.available_names(planar=False)})
+NAMES = sorted({*registry.zoo()} & {*registry.available_names(planar=False)})
 
 
 class Probe:

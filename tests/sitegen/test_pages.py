@@ -15,7 +15,7 @@ from coopenv.cars.profile import SVEA
 from coopenv.cars.sensor_settings import Correction
 from coopenv.cars.transport import Tls
 from coopenv.observers import registry
-from coopenv.observers.registry import ZOO
+from coopenv.observers.registry import zoo
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from coopenv.viz import FIGURE_NAMES
 from sitegen import mirror, pages, reference
@@ -30,14 +30,14 @@ def made() -> dict[str, str]:
 
 
 def test_there_is_a_page_of_every_observer_agent_and_environment(made: dict[str, str]) -> None:
-    assert {f"reference/observers/{name}_.md" for name in ZOO} <= made.keys()
+    assert {f"reference/observers/{name}_.md" for name in zoo()} <= made.keys()
     assert {f"reference/agents/{name}.md" for name in list_agents()} <= made.keys()
     assert all((ROOT / "docs" / "environments" / f"{name}.md").is_file() for name in list_envs())
     gallery = made["gallery.md"]
     assert all(f"(environments/{name}.md)" in gallery for name in list_envs())
     assert all((ROOT / "docs" / film).is_file() for film in re.findall(r"!\[[^]]*\]\(([^)]+)\)", gallery))
     listed = [next(iter(row.values())) for rows in pages.LISTED.values() for row in rows()]
-    assert len(listed) == len(ZOO) + len(list_agents()) + len(list_envs())
+    assert len(listed) == len(zoo()) + len(list_agents()) + len(list_envs())
     assert {page for page in listed if page.startswith("reference/")} <= made.keys()
 
 
@@ -53,7 +53,7 @@ def test_what_people_come_for_is_one_click_away(front: str, observations: str) -
 
 
 def test_pages_of_observers_say_where_they_come_from(made: dict[str, str]) -> None:
-    for name, entry in ZOO.items():
+    for name, entry in zoo().items():
         page = made[f"reference/observers/{name}_.md"]
         place, _, item = entry.plugin.partition(":")
         assert f"::: coopenv.observers.{place}.{item}" in page and "## Method and source" in page

@@ -1,4 +1,4 @@
-"""Sources of the benchmark's records: a simulated environment, recorded robots, or a log file.
+"""Sources of the benchmark's records: a simulated environment, a log file, or a ROS bag.
 
 A source is small and picklable, so that a worker process makes the record itself.
 """
@@ -16,7 +16,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from coopenv.backends.base import Backend
-from coopenv.backends.mrclam_dataset import IN_SPACE
 from coopenv.backends.registry import ENVIRONMENT, kind_of
 from coopenv.backends.selection import WHOLE, Selection
 from coopenv.backends.sources import OBJECT, is_recording, open_backend, open_recording
@@ -152,37 +151,6 @@ class SimulatedRecords(RecordSource):
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
         """Return when the steady state starts, s."""
         return steady_start(given, self.scenario.horizon)
-
-
-@dataclass(frozen=True)
-class Robots(RecordSource):
-    """A sub-dataset of MR.CLAM."""
-
-    data: Path | None
-    """The folder with the data; None: the environment variable COOPENV_DATA."""
-    selection: Selection = WHOLE
-    named: ClassVar[Mapping[str, str]] = ROBOT_VARIANTS
-    usual: ClassVar[tuple[str, ...]] = tuple(ROBOT_VARIANTS)
-    windowed: ClassVar[bool] = False
-    friendly: ClassVar[str] = (
-        "Friendly: robots start at their true pose; who is seen is known from barcodes, "
-        "their own left out; the wheels' response was fitted to these robots; all receive from all, 10 Hz, no loss."
-    )
-    """Options for reading tables of recorded robots."""
-
-    @property
-    def planar(self) -> bool:
-        """True if observers get commands on a plane, False for odometry in space."""
-        return not self.name.endswith(IN_SPACE)
-
-    def world(self) -> Recording:
-        """Return the robots' record."""
-        return open_recording(self.name, self.data, None, self.selection)
-
-    def recording(self, variant: str, seed: int) -> Recording:
-        """Return the robots' record in a variant."""
-        with already_warned():
-            return open_recording(self.name, self.data, variant, self.selection)
 
 
 @dataclass(frozen=True)
@@ -323,7 +291,7 @@ def find_source(
     folder, topic_map = (None if given is None else Path(given) for given in (data, topics))
     refused = {
         f"--policy {policy}: {text} is recorded, its vehicles cannot be driven": policy is not None,
-        f"--fault {next(iter(faults), '')}: recorded robots have variants of their own, {', '.join(Robots.named)}": (
+        f"--fault {next(iter(faults), '')}: recorded robots have variants of their own, {', '.join(ROBOT_VARIANTS)}": (
             kind.comparison and faults
         ),
         f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9": data and not kind.comparison,

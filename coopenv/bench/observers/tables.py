@@ -10,7 +10,7 @@ from rich.table import Table
 
 from coopenv.base.format import in_parentheses, number, with_error
 from coopenv.bench.observers.convergence import basin_failures, basin_table
-from coopenv.bench.observers.faults import NOMINAL, VARIANTS
+from coopenv.bench.observers.faults import FRIENDLY, NOMINAL, ROBOT_VARIANTS, VARIANTS
 from coopenv.bench.observers.judge import TimeWindow
 from coopenv.bench.observers.rows import (
     BOUNDS,
@@ -23,7 +23,6 @@ from coopenv.bench.observers.rows import (
     standard_error,
     verdict_on,
 )
-from coopenv.bench.observers.sources import Robots
 from coopenv.estimation.metrics import SETTLED, mean_or_nan
 from coopenv.estimation.poses import Array
 from coopenv.runs.console import number_table
@@ -133,8 +132,8 @@ def everything(board: Leaderboard, width: int = WIDTH) -> Iterator[Table | str]:
             yield ""
             yield levels
         yield from window_tables(board, variant, width)
-    if set(variants) <= set(Robots.named):
-        yield f"\n{Robots.friendly}"
+    if set(variants) <= set(ROBOT_VARIANTS):
+        yield f"\n{FRIENDLY}"
     if len(variants) > 1:
         yield ""
         yield variant_table(board, "mean RMSE [m]", "rmse", variants)

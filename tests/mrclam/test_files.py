@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coopenv.backends.mrclam import VARIANTS, check_variant, counted, load_dataset
-from coopenv.backends.mrclam_dataset import MAX_HOLD_S, HeldCommands, MotionCapture, find_folder
 from coopenv.base.errors import DataError, DataWarning
+from coopenv.mrclam.dataset import MAX_HOLD_S, HeldCommands, MotionCapture, find_folder
+from coopenv.mrclam.recording import VARIANTS, check_variant, counted, load_dataset
 from tests.helpers.mrclam_files import LANDMARKS, ORIGIN, command, pose, write
 
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from coopenv.estimation.poses import Array
+from coopenv.mrclam.planar_model import PlanarPose, misfit
 from coopenv.observers.contract import Received, Tick
-from coopenv.observers.planar_model import PlanarPose, misfit
 
 OLDEST_S = 2.0
 SPEED = 0.15  # m/s at which a sender may have moved since its message

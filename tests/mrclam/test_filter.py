@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from coopenv.observers.planar_filter import Mixture, PlanarFilter
-from coopenv.observers.planar_model import (
+from coopenv.mrclam.planar_filter import Mixture, PlanarFilter
+from coopenv.mrclam.planar_model import (
     ARC,
     BIAS,
     CALIBRATING,

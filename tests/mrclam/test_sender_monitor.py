@@ -7,11 +7,11 @@ import pytest
 
 from benchmarks.planar.changes import blindfolded
 from benchmarks.planar.lies import Drifting
-from coopenv.backends.mrclam import recording_of
+from coopenv.mrclam.planar import PlanarRobust
+from coopenv.mrclam.planar_fusion import ENOUGH, LEAST_STD, MOST_SEEN, RobotMonitor, sightings_of
+from coopenv.mrclam.planar_model import PlanarPose, misfit
+from coopenv.mrclam.recording import recording_of
 from coopenv.observers.contract import Setup
-from coopenv.observers.planar import PlanarRobust
-from coopenv.observers.planar_fusion import ENOUGH, LEAST_STD, MOST_SEEN, RobotMonitor, sightings_of
-from coopenv.observers.planar_model import PlanarPose, misfit
 from coopenv.observers.runner import run
 from tests.helpers.env_suite import rest_slow
 from tests.helpers.mrclam_files import barrier_robots

@@ -15,11 +15,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.backends.mrclam_dataset import MAX_TRUTH_GAP_S, ROBOTS, Dataset, HeldCommands, Robot, arc, load_dataset
 from coopenv.base.errors import DataError, suggest
 from coopenv.estimation.poses import Array, about_z
+from coopenv.mrclam.dataset import MAX_TRUTH_GAP_S, ROBOTS, Dataset, HeldCommands, Robot, arc, load_dataset
+from coopenv.mrclam.planar_model import ARC, CALIBRATING, IROBOT_CREATE, PATH, SLOWING, TURN, TURNING, CommandHistory
 from coopenv.observers.contract import Gains, SensorNoise, Setup
-from coopenv.observers.planar_model import ARC, CALIBRATING, IROBOT_CREATE, PATH, SLOWING, TURN, TURNING, CommandHistory
 from coopenv.observers.recording import Recording, Truth, check_recording, received_by_all
 
 __all__ = ["VARIANTS", "Dataset", "Variant", "load_dataset", "recording_of"]

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.mrclam import recording_of
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Coordinates
+from coopenv.mrclam.planar import PlanarEkf, PlanarRobust
+from coopenv.mrclam.recording import recording_of
 from coopenv.observers.contract import Gains, Message, Received, SensorNoise, Setup, Tick
-from coopenv.observers.planar import PlanarEkf, PlanarRobust
 from coopenv.observers.runner import run
 from tests.helpers.env_suite import rest_slow
 from tests.helpers.mrclam_files import barrier_robots, carried_off

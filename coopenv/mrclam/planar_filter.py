@@ -25,7 +25,7 @@ from typing import Self
 import numpy as np
 
 from coopenv.estimation.poses import Array
-from coopenv.observers.planar_model import (
+from coopenv.mrclam.planar_model import (
     ARC,
     BIAS,
     COMMANDED,

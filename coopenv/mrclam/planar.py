@@ -12,10 +12,9 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Array
-from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.planar_filter import Mixture, PlanarFilter
-from coopenv.observers.planar_fusion import LOWER, RobotMonitors, received_position, sightings_of
-from coopenv.observers.planar_model import (
+from coopenv.mrclam.planar_filter import Mixture, PlanarFilter
+from coopenv.mrclam.planar_fusion import LOWER, RobotMonitors, received_position, sightings_of
+from coopenv.mrclam.planar_model import (
     BIAS,
     CALIBRATING,
     HEADING,
@@ -28,7 +27,8 @@ from coopenv.observers.planar_model import (
     X,
     Y,
 )
-from coopenv.observers.planar_search import LossTest, PoseInformation, Sighting, SightingHistory, find_pose
+from coopenv.mrclam.planar_search import LossTest, PoseInformation, Sighting, SightingHistory, find_pose
+from coopenv.observers.contract import Estimate, Message, Setup, Tick
 
 PLANE = np.ix_((2, 3, 4), (2, 3, 4))  # indices of the LEFT coordinates in the plane: yaw, forward, left
 OUT_OF_PLANE_STD = 1e-3  # rad and m

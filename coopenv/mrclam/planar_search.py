@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coopenv.estimation.poses import Array
-from coopenv.observers.planar_model import OdometryStep, PlanarPose, wrapped
+from coopenv.mrclam.planar_model import OdometryStep, PlanarPose, wrapped
 
 REFUSED = 16.0  # normalised innovation squared (4 standard deviations) of a bearing that does not fit
 WINDOW = 10  # bearings

@@ -1,0 +1,39 @@
+"""Robots of MR.CLAM as records of the benchmark."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from coopenv.backends.selection import WHOLE, Selection
+from coopenv.backends.sources import open_recording
+from coopenv.bench.observers.faults import ROBOT_VARIANTS
+from coopenv.bench.observers.sources import RecordSource, already_warned
+from coopenv.mrclam.dataset import IN_SPACE
+from coopenv.observers.recording import Recording
+
+
+@dataclass(frozen=True)
+class Robots(RecordSource):
+    """A sub-dataset of MR.CLAM."""
+
+    data: Path | None
+    """The folder with the data; None: the environment variable COOPENV_DATA."""
+    selection: Selection = WHOLE
+    named: ClassVar[Mapping[str, str]] = ROBOT_VARIANTS
+    usual: ClassVar[tuple[str, ...]] = tuple(ROBOT_VARIANTS)
+    windowed: ClassVar[bool] = False
+
+    @property
+    def planar(self) -> bool:
+        """True if observers get commands on a plane, False for odometry in space."""
+        return not self.name.endswith(IN_SPACE)
+
+    def world(self) -> Recording:
+        """Return the robots' record."""
+        return open_recording(self.name, self.data, None, self.selection)
+
+    def recording(self, variant: str, seed: int) -> Recording:
+        """Return the robots' record in a variant."""
+        with already_warned():
+            return open_recording(self.name, self.data, variant, self.selection)
