@@ -231,7 +231,7 @@ class Filtered:
 sys.meta_path[:] = [Filtered(finder) if hasattr(finder, "find_spec") else finder for finder in sys.meta_path]
 import coopenv.api.engine
 import coopenv.policies
-import coopenv.runs.demo
+import coopenv.cars.commands.demo
 import coopenv.runs.recorder
 import coopenv.runs.live
 from coopenv.cli.app import main

@@ -20,22 +20,21 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command
 from coopenv.base.installation import version as installed_version
 from coopenv.cli import options
-from coopenv.cli.bags import calibrate, identify, import_
 from coopenv.cli.bench import bench, bench_observers
+from coopenv.cli.plugins import Extended
 from coopenv.cli.run import bundle, export, figures, record, run
-from coopenv.cli.svea import svea
 from coopenv.cli.train import dataset, evaluate, train
 from coopenv.cli.view import film, play, view, watch
 
 UsageError: Any = typer.BadParameter.__base__  # raised for every mistake in the options; it has no public name
 INTERRUPTED, PIPE_CLOSED = 130, 141  # exit statuses, 128 plus the number of the signal
 
-LOOK, RUN, COMPARE, TRAIN, VIEW, CARS = "Look around", "Run and record", "Compare", "Train", "View", "Cars"
+LOOK, RUN, COMPARE, TRAIN, VIEW = "Look around", "Run and record", "Compare", "Train", "View"
 """Groups of the list of commands."""
 
 app = typer.Typer(
     name="coopenv",
-    cls=options.Grouped,
+    cls=Extended,
     help="Cooperative localisation of connected vehicles.",
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -153,10 +152,6 @@ app.command(rich_help_panel=TRAIN)(train)
 app.command(rich_help_panel=TRAIN)(dataset)
 for command in (view, film, watch, play):
     app.command(rich_help_panel=VIEW)(command)
-app.add_typer(svea, name="svea", rich_help_panel=CARS)
-app.command("import", rich_help_panel=CARS)(import_)
-app.command(rich_help_panel=CARS)(calibrate)
-app.command(rich_help_panel=CARS)(identify)
 
 
 @app.command(rich_help_panel=VIEW)

@@ -275,7 +275,7 @@ class Grouped(TyperGroup):
     def resolve_command(self, ctx: typer.Context, args: list[str]) -> Any:  # type: ignore[override]
         """Return the command that the arguments begin with."""
         name = args[0]
-        if name not in self.commands:
+        if self.get_command(ctx, name) is None:
             runs = f"; an environment runs with: coopenv run {name}" if name in list_envs() else ""
             options = [option for parameter in self.get_params(ctx) for option in parameter.opts]
             near = f" (did you mean '--{name}'?)" if f"--{name}" in options else suggest(name, self.commands)
@@ -315,10 +315,10 @@ def print_help(context: typer.Context) -> None:
         print(context.get_help())
 
 
-def group(words: str) -> typer.Typer:
-    """Return a group of commands, which is described in some words."""
+def group(words: str, panel: str | None = None) -> typer.Typer:
+    """Return a group of commands, which is described in some words; its `panel` is that of the list of commands."""
     look: dict[str, Any] = {"cls": Grouped, "rich_markup_mode": None}
-    return typer.Typer(help=words, invoke_without_command=True, callback=print_help, **look)
+    return typer.Typer(help=words, invoke_without_command=True, callback=print_help, rich_help_panel=panel, **look)
 
 
 def command(function: Callable[[Options], None]) -> Callable[..., None]:

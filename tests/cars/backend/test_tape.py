@@ -29,11 +29,11 @@ from coopenv.backends.registry import kind_of
 from coopenv.base.errors import DataError, DataWarning, OutputError
 from coopenv.cars.backend.drive import PRESENCE, Drive, DriveRecorder, RecordedTransport
 from coopenv.cars.codec import MOST_BYTES, TICK, encode, header, make
+from coopenv.cars.commands.demo import links_report
 from coopenv.cars.fake.lockstep import Hub
 from coopenv.cars.profile import STOPPED_TOPIC, SVEA, TICK_TOPIC, Role, presence_of
 from coopenv.cars.source import DRIVE
 from coopenv.runs.command import execute, report
-from coopenv.runs.demo import links_report
 from coopenv.runs.rollouts import Rollout
 from tests.helpers.cars import cars, fakes, write_fleet
 from tests.helpers.processes import DEADLOCK, start

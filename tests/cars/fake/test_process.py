@@ -24,6 +24,7 @@ from coopenv.cars.backend.binding import bind
 from coopenv.cars.backend.station import Gates
 from coopenv.cars.clock import SimulatedClock
 from coopenv.cars.codec import MOST_BYTES, encode, make
+from coopenv.cars.commands.svea import next_message
 from coopenv.cars.deployment import DeploymentError, Safety, load_deployment
 from coopenv.cars.fake.fleet import FakesError, free_port
 from coopenv.cars.fake.fleet import fakes as fake_processes
@@ -34,7 +35,6 @@ from coopenv.cars.profile import SVEA, Limits, Role, presence_of
 from coopenv.cars.transport import Arrival
 from coopenv.cars.zenoh import open_zenoh
 from coopenv.cli.app import app
-from coopenv.cli.svea import next_message
 from tests.helpers.cars import OVERTAKING, open_fake, write_fleet
 from tests.helpers.processes import ROOT, mentioning, start, wait_until
 from tests.helpers.wire import free_endpoint, seen_by

@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from coopenv.base.errors import CoopenvError
+from coopenv.cars.commands import PANEL
 from coopenv.cli import options
 
 if TYPE_CHECKING:
     from coopenv.cars.transport import Transport
 
-svea = options.group("SVEA cars, real ones and fakes.")
+svea = options.group("SVEA cars, real ones and fakes.", PANEL)
 HARMED = 1
 """Exit status of an attack that got through."""
 STOPPED = 3
@@ -60,7 +61,7 @@ def demo(
     The first time kernels are compiled, which takes a minute or two. The exit status is 3 where the watchdog stopped
     the cars.
     """
-    from coopenv.runs.demo import Demo
+    from coopenv.cars.commands.demo import Demo
 
     if environment is not None and fleet is not None:
         raise CoopenvError(f"--environment: {fleet} names one; give --environment or --fleet")
@@ -431,8 +432,8 @@ def run(given: SveaRunOptions) -> None:
     """
     from coopenv.base.interrupts import also_kept
     from coopenv.cars.backend.backend import open_svea
+    from coopenv.cars.commands.demo import check_alive, kept_drive, links_line, links_report, truth_report
     from coopenv.runs.command import execute, report
-    from coopenv.runs.demo import check_alive, kept_drive, links_line, links_report, truth_report
     from coopenv.runs.rollouts import Rollout
 
     changes, log = options.parse_overrides(given.overrides), options.console(stderr=True)

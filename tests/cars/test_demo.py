@@ -24,6 +24,8 @@ from coopenv.base.errors import CoopenvError, DataWarning
 from coopenv.cars.backend.backend import open_svea
 from coopenv.cars.backend.station import Gates, Pacer
 from coopenv.cars.codec import encode, header, make
+from coopenv.cars.commands.demo import FLEETS, Demo, links_line, links_report
+from coopenv.cars.commands.svea import STOPPED
 from coopenv.cars.fake.car import fault_topic
 from coopenv.cars.fake.fleet import fakes as fake_processes
 from coopenv.cars.fake.fleet import free_port
@@ -31,10 +33,8 @@ from coopenv.cars.fake.lockstep import Hub
 from coopenv.cars.profile import SVEA, USUAL, Role
 from coopenv.cars.zenoh import open_zenoh
 from coopenv.cli.app import app
-from coopenv.cli.svea import STOPPED
 from coopenv.estimation.observability import Trajectory
 from coopenv.runs.command import execute, report
-from coopenv.runs.demo import FLEETS, Demo, links_line, links_report
 from coopenv.runs.rollouts import Rollout
 from coopenv.viz.trajectories import trajectory_figure_2d
 from tests.helpers.cars import OVERTAKING, cars, fakes, write_fleet
