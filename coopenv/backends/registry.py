@@ -16,8 +16,6 @@ from coopenv.base.installation import is_scene, list_envs
 from coopenv.base.plugins import call, loaded, offered
 
 if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
-
     from coopenv.backends.base import Backend
     from coopenv.backends.selection import Selection
     from coopenv.observers.recording import Recording
@@ -44,8 +42,8 @@ class SourceKind:
     """True if its ticks are recorded; otherwise the name of the entry point is one for the option `backend`, too."""
     reader: str = ""
     """Function of a name, the folder `data` and a `variant` that returns a `Recording`; empty: it gives only ticks."""
-    conversion: str = "coopenv record {} --out FILE.mcap"
-    """Command that makes a recording of a name whose kind has no reader."""
+    conversion: str = "coopenv record"
+    """Command that makes a recording of a name, where there is no reader."""
     example: str = ""
     """Names for which the reader is."""
     comparison: str = ""
@@ -56,18 +54,16 @@ class SourceKind:
     def open(
         self, name: ScenarioLike, overrides: Mapping[str, Any], given: Mapping[str, Any], selection: Selection
     ) -> Backend:
-        """Return the backend of a name; options are `given` by name, None where they are not.
+        """Return the backend of a name; options are `given` by name.
 
         Raises:
             CoopenvError: an option is not for this kind, or it cannot be opened.
         """
-        options = {option: value for option, value in given.items() if value is not None}
-        if selection.given:
-            options["selection"] = selection
+        options = {**given, **({"selection": selection} if selection.given else {})}
         for option in [option for option in options if option not in self.options]:
             first = next(iter(selection.given)) if option == "selection" else option
             raise CoopenvError(f"{first} is for {self._readers(option)}, '{name}' is {self.title}")
-        backend: Backend = call(self.opener, f"source '{name}'", name, overrides, **options)
+        backend: Backend = call(self.opener, name, overrides, **options)
         return backend
 
     def _readers(self, option: str) -> str:
@@ -96,28 +92,23 @@ def no_name(name: str, topics: str | Path | None) -> bool:
     return False
 
 
-def kind_named(name: str) -> SourceKind:
-    """Return the kind of an entry point. Raises CoopenvError: there is none, or it cannot be loaded."""
-    points = offered(GROUP)
-    check_one_of("unknown source", name, points)
-    return _kind(points[name])
+def kinds(asked: str = "") -> dict[str, SourceKind]:
+    """Return the kinds of guests and installed packages by name, without those that cannot be loaded.
 
-
-def _kind(point: EntryPoint) -> SourceKind:
-    kind = loaded(point, "source")
-    if not isinstance(kind, SourceKind):
-        raise CoopenvError(f"source '{point.name}' ({point.value}): expected a SourceKind, got {shown(kind)}")
-    return kind
-
-
-def kinds() -> dict[str, SourceKind]:
-    """Return the kinds of guests and installed packages by name, without those that cannot be loaded."""
+    Raises:
+        CoopenvError: the one that is asked for cannot be loaded.
+    """
     found = {}
     for name, point in offered(GROUP).items():
         try:
-            found[name] = _kind(point)
-        except CoopenvError:  # an error for those who name it
-            continue
+            found[name] = loaded(point, "source")
+            if not isinstance(found[name], SourceKind):
+                raise CoopenvError(
+                    f"source '{name}' ({point.value}): expected a SourceKind, got {shown(found.pop(name))}"
+                )
+        except CoopenvError:
+            if name == asked:
+                raise
     return found
 
 
@@ -127,9 +118,7 @@ def live_kind(name: str, others: Mapping[str, SourceKind]) -> SourceKind:
     Raises:
         CoopenvError: there is none, or it cannot be loaded.
     """
-    if name in offered(GROUP) and name not in others:
-        kind_named(name)  # raises if it cannot be loaded
-    live = {entry: kind for entry, kind in kinds().items() if kind.opener and not kind.recorded}
+    live = {entry: kind for entry, kind in kinds(name).items() if kind.opener and not kind.recorded}
     known = {**others, **live, **others}
     check_one_of("unknown backend", name, known)
     return known[name]
@@ -146,10 +135,8 @@ def kind_of(name: ScenarioLike | Recording, topics: str | Path | None = None) ->
     text = str(name)
     if not isinstance(name, str | Path) or (topics is None and (text in list_envs() or is_scene(text))):
         return ENVIRONMENT
-    entry = text.partition(":")[0]
-    if (point := offered(GROUP).get(entry)) and _kind(point).claims is None:
-        return _kind(point)
-    for kind in (*kinds().values(), LOG):
-        if kind.claims is not None and kind.claims(text, topics):
+    first = text.partition(":")[0]
+    for entry, kind in {**kinds(first), "": LOG}.items():
+        if kind.claims(text, topics) if kind.claims else entry == first:
             return kind
     return ENVIRONMENT

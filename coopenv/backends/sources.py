@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
-from coopenv.backends.registry import ENVIRONMENT, LOG, kind_named, kind_of, kinds, live_kind
+from coopenv.backends.registry import ENVIRONMENT, LOG, kind_of, kinds, live_kind
 from coopenv.backends.selection import WHOLE, Selection
 from coopenv.base.errors import CoopenvError, DataError, check_one_of
 from coopenv.base.plugins import call
@@ -65,9 +65,11 @@ def open_recording(
     """
     kind = kind_of(name)
     if kind.reader:
-        return selection.applied(call(kind.reader, f"source '{name}'", name, data, variant), str(name))
+        return selection.applied(call(kind.reader, name, data, variant), str(name))
     if kind.recorded:
-        raise DataError(f"{name}: {kind.title}; make a recording of it with: {kind.conversion.format(name)}")
+        given = " --map topics.toml" if "topics" in kind.options else ""
+        command = f"{kind.conversion} {name}{given} --out FILE.mcap"
+        raise DataError(f"{name}: {kind.title}; make a recording of it with: {command}")
     known = [kind.example for kind in (LOG, *kinds().values()) if kind.example]
     raise DataError(f"'{name}' is no recording; known: {', '.join(known)}")
 
@@ -120,7 +122,7 @@ def simulation_of(scenario: Scenario) -> Simulated:
 
         return Cosimulated(scenario)
     if scenario.sensing == "images":
-        made: Simulated = call(kind_named(scenario.sensing).simulation, scenario.sensing, scenario)
+        made: Simulated = call(kinds()[scenario.sensing].simulation, scenario)
         return made
     from coopenv.backends.worlds import Simulated
 

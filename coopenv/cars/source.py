@@ -58,7 +58,7 @@ BAG = SourceKind(
     claims=is_bag,
     options=("topics", "selection"),
     recorded=True,
-    conversion="coopenv import {} --map topics.toml --out FILE.mcap",
+    conversion="coopenv import",
 )
 DRIVE = SourceKind(
     title="a drive of cars, which --map opens as a bag",

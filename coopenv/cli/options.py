@@ -315,10 +315,10 @@ def print_help(context: typer.Context) -> None:
         print(context.get_help())
 
 
-def group(words: str, panel: str | None = None) -> typer.Typer:
-    """Return a group of commands, which is described in some words; its `panel` is that of the list of commands."""
+def group(words: str) -> typer.Typer:
+    """Return a group of commands, which is described in some words."""
     look: dict[str, Any] = {"cls": Grouped, "rich_markup_mode": None}
-    return typer.Typer(help=words, invoke_without_command=True, callback=print_help, rich_help_panel=panel, **look)
+    return typer.Typer(help=words, invoke_without_command=True, callback=print_help, **look)
 
 
 def command(function: Callable[[Options], None]) -> Callable[..., None]:

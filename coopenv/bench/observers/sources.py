@@ -307,7 +307,7 @@ def find_source(
     if ticks:
         return Bags(path.stem, path, topic_map, dict(overrides or {}), selection, added=added)
     if kind.comparison:
-        made: RecordSource = call(kind.comparison, f"source '{text}'", str(text), folder, selection)
+        made: RecordSource = call(kind.comparison, str(text), folder, selection)
         return made
     return LogFile(path.stem, path, selection, added=added)
 

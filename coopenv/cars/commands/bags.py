@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.commands import PANEL
 from coopenv.cli import options
-from coopenv.cli.plugins import in_panel
 from coopenv.cli.run import check_log
 
 if TYPE_CHECKING:
@@ -21,7 +19,6 @@ if TYPE_CHECKING:
     from coopenv.cars.calibration import Calibrated, ConstantRow
 
 
-@in_panel(PANEL)
 def import_(
     bags: Annotated[list[Path], options.bags(help="Bags of one drive, such as one per car.")],
     topics: options.TopicMap = None,
@@ -120,7 +117,6 @@ def _print_topics(rows: Sequence[TopicRow], as_json: bool) -> None:
     options.console().print(table)
 
 
-@in_panel(PANEL)
 def calibrate(
     bags: Annotated[
         list[Path], options.bags(metavar="BAG...|FILE.mcap", help="Bags of one drive, or a log of coopenv.")
@@ -178,7 +174,6 @@ def _print_calibrated(result: Calibrated, files: Sequence[Path]) -> None:
     console.print(f"Files: {', '.join(map(str, files))}", soft_wrap=True)
 
 
-@in_panel(PANEL)
 def identify(
     bags: Annotated[list[Path], options.bags(help="Bags of one drive, with the commands.")],
     topics: options.TopicMap = None,

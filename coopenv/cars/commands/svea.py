@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.commands import PANEL
 from coopenv.cli import options
 
 if TYPE_CHECKING:
     from coopenv.cars.transport import Transport
 
-svea = options.group("SVEA cars, real ones and fakes.", PANEL)
+svea = options.group("SVEA cars, real ones and fakes.")
 HARMED = 1
 """Exit status of an attack that got through."""
 STOPPED = 3
