@@ -25,6 +25,7 @@ ROOMS = (
     ("runs",),
     ("bench",),
     ("cli", "__init__"),
+    ("sumo",),
     ("mrclam",),
     ("cars",),
     ("__main__",),
@@ -80,7 +81,7 @@ def test_imports_point_downwards(imports: dict[str, set[str]]) -> None:
     assert not upwards, upwards
 
 
-GUESTS = ("cars", "mrclam")
+GUESTS = ("cars", "mrclam", "sumo")
 """Rooms that come in through entry points of `pyproject.toml` alone."""
 
 

@@ -107,7 +107,7 @@ def test_describe_says_what_matters_on_one_screen(name: str, capsys: pytest.Capt
 def test_describe_starts_no_traffic_program(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("coopenv.backends.sumo.find_spec", lambda name: None)
+    monkeypatch.setattr("coopenv.sumo.program.find_spec", lambda name: None)
     assert main(["describe", "sumo_crossing"]) == 0
     assert "6 in traffic" in capsys.readouterr().out
 

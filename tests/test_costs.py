@@ -34,7 +34,7 @@ from coopenv.observers import Recording
 from coopenv.observers.contract import SensorNoise
 from coopenv.policies.loader import read_card
 from coopenv.runs.bundle import Bundle, Manifest, RunEnd
-from coopenv.scenario import sumo_files
+from coopenv.sumo import files as sumo_files
 from coopenv.training.settings import read_settings
 from tests.helpers import bags, builders, mrclam_files
 

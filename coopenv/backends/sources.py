@@ -41,11 +41,6 @@ def source_name(given: ScenarioLike | Recording) -> str:
     return OBJECT if is_recording(given) else scenario_name(given)
 
 
-def is_recorded(name: ScenarioLike) -> TypeGuard[str | Path]:
-    """Return whether a name is that of a recording and not of an environment."""
-    return kind_of(name).recorded
-
-
 def open_recording(
     name: str | Path,
     data: str | Path | None = None,

@@ -36,8 +36,8 @@ from coopenv.base.sections import Section, validated
 from coopenv.observers.registry import named, portable
 from coopenv.runs.rollouts import Rollout
 from coopenv.scenario import load_scenario, parse_scenario
+from coopenv.scenario.cosimulators import Sumo
 from coopenv.scenario.own_terms import located
-from coopenv.scenario.sumo_files import TRAFFIC_OPTIONS
 from coopenv.world.warp_internals import kernel_hashes
 
 RECORD_FILE = "record.zip"
@@ -276,7 +276,7 @@ class Bundle:
         """Refuse options with which another simulator would write files or import code."""
         sumo, highway = raw.get("sumo"), raw.get("highway")
         options = sumo.get("options") if isinstance(sumo, dict) else None
-        if options and not (isinstance(options, dict) and options.keys() <= {*TRAFFIC_OPTIONS}):
+        if options and not (isinstance(options, dict) and options.keys() <= {*Sumo.traffic_options}):
             raise DataError(f"{self.path}: scenario.json: sumo.options: can write files, so it is not replayed")
         config = highway.get("config") if isinstance(highway, dict) else None
         for key, value in config.items() if isinstance(config, dict) else ():

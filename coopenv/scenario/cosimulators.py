@@ -1,12 +1,20 @@
-"""Sections of the programs that may move the vehicles in place of coopenv, see docs/backends.md."""
+"""Sections of the programs that may move the vehicles in place of coopenv, see docs/backends.md.
+
+A package offers its own program, a `coopenv.backends.cosimulation.TrafficProgram`, under the entry point group
+`coopenv.cosimulators`. In a scenario its name is that of the `backend`, and its section holds its further arguments.
+"""
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, JsonValue
 
 from coopenv.base import units
+from coopenv.base.plugins import call, offered
 from coopenv.base.sections import NonNegative, Positive, Section, Word
+
+GROUP = "coopenv.cosimulators"
 
 File = Annotated[str, Field(min_length=1, max_length=1_000)]
 """A path; a relative one is looked for beside the scenario's file."""
@@ -19,6 +27,12 @@ class Cosimulator(Section):
     """Name of the program."""
     program: ClassVar[str]
     """Its `coopenv.backends.cosimulation.TrafficProgram`, `module:class`, made from the scenario."""
+    files: ClassVar[tuple[str, ...]] = ()
+    """Keys that name files or code of the user's own."""
+    unrecorded: ClassVar[Mapping[str, Any]] = {}
+    """Values in recordings, which name neither files nor code."""
+    completion: ClassVar[str] = ""
+    """Function, `module:name`, that adds the content of the files to the plain data of a scenario."""
     reference_midway: ClassVar[bool] = False
     """True if its vehicles' reference point is midway between the axles instead of on the rear axle."""
 
@@ -55,7 +69,12 @@ class Sumo(Cosimulator):
     """Network, routes and traffic of SUMO, see docs/sumo.md."""
 
     title = "SUMO"
-    program = "coopenv.backends.sumo:SumoProgram"
+    program = "coopenv.sumo.program:SumoProgram"
+    files = ("net", "routes", "additional")
+    unrecorded = MappingProxyType({"net": "not_recorded", "routes": [], "additional": [], "included": True})
+    completion = "coopenv.sumo.files:with_sumo"
+    traffic_options: ClassVar = ("ignore-route-errors", "lateral-resolution", "scale", "step-method.ballistic")
+    """Options that a configuration may set. None names a file that SUMO would write."""
 
     most_vehicles: int = Field(default=1_000, ge=0, le=10_000)
     """Largest number of vehicles on its road besides this file's: traffic that only occludes and collides."""
@@ -88,6 +107,8 @@ class Program(Cosimulator):
 
     title = "the program"
     program = "coopenv.backends.cosimulation:own_program"
+    files = ("code",)
+    unrecorded = MappingProxyType({"code": "not_recorded:none"})
 
     code: Annotated[str, Field(min_length=1, max_length=1_000, pattern=":")]
     """Class that is made from the scenario, `file.py:Class`."""
@@ -98,6 +119,27 @@ class Program(Cosimulator):
 COSIMULATORS: Mapping[str, type[Cosimulator]] = {"highway": Highway, "sumo": Sumo, "program": Program}
 """Co-simulators by their names in `backend`, which are fields of `Scenario`."""
 
-
-FILES: Mapping[str, tuple[str, ...]] = {"sumo": ("net", "routes", "additional"), "program": ("code",)}
+FILES: Mapping[str, tuple[str, ...]] = {name: section.files for name, section in COSIMULATORS.items() if section.files}
 """Keys of sections that name files or code of the user's own."""
+
+
+def completed(raw: Any) -> Any:
+    """Return the plain data of a scenario with what its co-simulator adds; another package's becomes a `[program]`.
+
+    What is not as it should be is left for the schema to complain about.
+
+    Raises:
+        ScenarioError: a file cannot be read.
+    """
+    name = raw.get("backend") if isinstance(raw, Mapping) else None
+    if not isinstance(name, str) or name == "simulated":
+        return raw
+    if name in COSIMULATORS:
+        return call(place, raw) if (place := COSIMULATORS[name].completion) else raw
+    if "program" in raw or name not in (points := offered(GROUP)):
+        return raw
+    options = raw.get(name, {})
+    known = {key: options[key] for key in ("most_vehicles",) if isinstance(options, dict) and key in options}
+    options = {key: value for key, value in options.items() if key not in known} if known else options
+    program = {"code": points[name].value, "options": options, **known}
+    return {**{key: value for key, value in raw.items() if key != name}, "backend": "program", "program": program}

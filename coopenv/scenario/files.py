@@ -15,11 +15,11 @@ from coopenv.base.installation import is_scene, scenario_path
 from coopenv.base.sections import MOST_BYTES, TOO_DEEP, Section, read_toml, validated
 from coopenv.base.units import TEXTS
 from coopenv.scenario.bodies import with_groups
+from coopenv.scenario.cosimulators import completed
 from coopenv.scenario.own_terms import located
 from coopenv.scenario.scenes import MOST_VEHICLES, scene_text
 from coopenv.scenario.schema import Scenario
 from coopenv.scenario.sites import STREETS_KEY, Streets, with_streets
-from coopenv.scenario.sumo_files import with_sumo
 
 DEFAULTS_KEY = "vehicle_defaults"
 """A table of the file whose entries hold for every vehicle without its own."""
@@ -121,7 +121,7 @@ def parse_scenario(raw: Mapping[str, Any], where: str) -> Scenario:
     """
     try:
         # Through JSON, where the strict mode refuses "5" and true for a number but takes lists for tuples.
-        text = json.dumps(with_groups(with_sumo(raw)), default=plain)
+        text = json.dumps(with_groups(completed(raw)), default=plain)
     except (TypeError, ValueError) as error:  # keys that are no text, tables within themselves, thousands of digits
         raise ScenarioError(f"{where}: {error}") from None
     except RecursionError:

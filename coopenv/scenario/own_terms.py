@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from coopenv.base import installation
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.sections import one_line
-from coopenv.scenario.cosimulators import FILES
+from coopenv.scenario.cosimulators import COSIMULATORS, FILES
 from coopenv.scenario.terms import (
     GROUPS,
     OBSERVATION_FIELDS,
@@ -173,10 +173,9 @@ def _located(row: Any, folder: Path, place: Callable[[str, Path], str]) -> Any:
 def without_own_terms(raw: Mapping[str, Any]) -> dict[str, Any]:
     """Return a scenario with terms of coopenv only, for recordings, which must name neither code nor folders."""
     result = dict(raw)
-    nothing = {"net": "not_recorded", "routes": [], "additional": [], "included": True}
-    for key, own in (("program", {"code": "not_recorded:none"}), ("sumo", nothing)):
+    for key, simulator in COSIMULATORS.items():
         if isinstance(raw.get(key), dict):
-            result[key] = {**raw[key], **own}
+            result[key] = {**raw[key], **simulator.unrecorded}
     for section, kind in SECTIONS.items():
         if not isinstance(raw.get(section), dict):
             continue

@@ -11,6 +11,7 @@ import pytest
 import coopenv
 from coopenv import CoopenvError
 from coopenv.api.engine import Engine
+from tests.helpers.plugins import install
 
 CODE = '''
 import numpy as np
@@ -61,6 +62,22 @@ def own(tmp_path: Path) -> dict[str, Any]:
         "landmarks": [{"name": n, "position": p} for n, p in (("a", [9, 9, 2]), ("b", [-9, 9, 2]), ("c", [9, -9, 2]))],
         "vehicles": [{"motion": {"kind": "traffic"}}, {"motion": {"kind": "driven"}}],
     }
+
+
+def test_a_program_of_another_package_is_a_backend_by_its_name(
+    own: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = {"orbit": "orbits:Circle", "lost": "no_such_module:Circle"}
+    install(tmp_path, monkeypatch, "orbits", CODE, {"coopenv.cosimulators": points})
+    section = {**own.pop("program")["options"], "most_vehicles": 1}
+    scenario = coopenv.scenario.parse_scenario({**own, "backend": "orbit", "orbit": section}, "circle")
+    assert scenario.program is not None and scenario.program.most_vehicles == 1
+    env = coopenv.parallel_env(scenario, dtype="float64")
+    env.reset(seed=0)
+    env.step({agent: np.array([1.0, 0.0]) for agent in env.agents})
+    assert env.engine.view("position")[0, -2, :2] == pytest.approx([5.0 * np.cos(0.05), 5.0 * np.sin(0.05)])
+    with pytest.raises(CoopenvError, match=r"'no_such_module:Circle' cannot be loaded: ModuleNotFoundError"):
+        coopenv.parallel_env(coopenv.scenario.parse_scenario({**own, "backend": "lost"}, "circle"))
 
 
 def test_a_program_moves_what_it_does_not_leave_to_actions(own: dict[str, Any]) -> None:

@@ -23,7 +23,7 @@ from coopenv.cars.bags.topic_map import load_map
 from coopenv.cli.app import main
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Truth, check_recording
-from coopenv.scenario import sumo_files
+from coopenv.sumo import files as sumo_files
 from tests.helpers import mrclam_files
 from tests.helpers.recordings import simulated
 

@@ -37,8 +37,6 @@ CONFIGURATIONS = (".sumocfg", ".cfg")
 MOST_CONFIGURATION = 2**20  # bytes
 CONFIGURED_FILES = {"net": "net-file", "routes": "route-files", "additional": "additional-files"}
 """Keys of a section, and SUMO's names of them in a configuration, whose paths are relative to it."""
-TRAFFIC_OPTIONS = ("ignore-route-errors", "lateral-resolution", "scale", "step-method.ballistic")
-"""Options that a configuration may set. None names a file that SUMO would write."""
 
 Shape = np.ndarray
 """(K, 2) m."""
@@ -118,7 +116,7 @@ def _with_configuration(section: Mapping[str, Any]) -> dict[str, Any]:
         if not found["net"] or found["net"][0].endswith(CONFIGURATIONS):
             raise ScenarioError(f"sumo.net: {path.name}: it names no network (net-file)")
         found |= {"begin": _seconds(given["begin"])} if "begin" in given else {}
-    options = {name: given[name] for name in TRAFFIC_OPTIONS if name in given} | section.get("options", {})
+    options = {name: given[name] for name in Sumo.traffic_options if name in given} | section.get("options", {})
     return {**found, **section, "net": found["net"][0], "options": options}
 
 

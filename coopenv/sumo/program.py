@@ -1,6 +1,6 @@
 """SUMO as a co-simulator: its networks, routes and traffic under this project's cameras, radio and observers.
 
-SUMO runs in a process of its own for each world (`coopenv.backends.sumo_process`): worlds of a batch run at the same
+SUMO runs in a process of its own for each world (`coopenv.sumo.process`): worlds of a batch run at the same
 time, and the end of one is an error and not the end of this program.
 """
 
@@ -18,13 +18,13 @@ from weakref import finalize
 
 import numpy as np
 
-from coopenv.backends import sumo_process
 from coopenv.backends.cosimulation import Moment, Poses, TrafficProgram
 from coopenv.base.errors import CoopenvError, ScenarioError, check_one_of, shortened
 from coopenv.base.installation import install_command
 from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario
-from coopenv.scenario.sumo_files import departures, route_edges
+from coopenv.sumo import process
+from coopenv.sumo.files import departures, route_edges
 
 OWNED = {
     "additional-files": "sumo.additional",
@@ -202,7 +202,7 @@ class SumoProgram(TrafficProgram):
 
     def _ask(self, request: Mapping[str, Any]) -> None:
         if self._process is None:
-            command = [sys.executable, "-P", str(Path(sumo_process.__file__))]
+            command = [sys.executable, "-P", str(Path(process.__file__))]
             pipe, self._errors = subprocess.PIPE, tempfile.TemporaryFile()  # noqa: SIM115 (closed by _end)
             self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self._errors)
             self._end = finalize(self, _end, self._process, self._errors)

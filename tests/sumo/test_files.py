@@ -10,11 +10,11 @@ import pytest
 
 import coopenv
 from coopenv import ScenarioError
-from coopenv.backends import sumo
 from coopenv.backends.cosimulation import Moment
-from coopenv.backends.sumo_process import SumoTraffic
 from coopenv.scenario import Scenario
-from coopenv.scenario.sumo_files import departures
+from coopenv.sumo import program as sumo
+from coopenv.sumo.files import departures
+from coopenv.sumo.process import SumoTraffic
 
 NET = """<net version="1.20" {root}>
 <location convBoundary="0.00,0.00,100.00,40.00"/>

@@ -297,7 +297,7 @@ def test_what_cannot_be_is_said_in_one_line(overrides: dict[str, Any], why: str)
 
 
 def test_without_sumo_one_line_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coopenv.backends.sumo.find_spec", lambda name: None)
+    monkeypatch.setattr("coopenv.sumo.program.find_spec", lambda name: None)
     with pytest.raises(CoopenvError, match=r"^backend 'sumo' needs SUMO, which is not installed: pip install"):
         coopenv.parallel_env(CROSSING)
 

@@ -1,4 +1,4 @@
-"""SUMO in a process of its own, which `coopenv.backends.sumo` starts and talks to through pipes.
+"""SUMO in a process of its own, which `coopenv.sumo.program` starts and talks to through pipes.
 
 Every request is a line of JSON on the standard input. Every reply is a line of JSON with the numbers of rows, and then
 the rows as 64-bit floats; or a line with the key `error`. SUMO's own server (TraCI) listens on all interfaces of a

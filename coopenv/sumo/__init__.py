@@ -1,0 +1,1 @@
+"""SUMO as a co-simulator."""
