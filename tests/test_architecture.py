@@ -25,6 +25,7 @@ ROOMS = (
     ("runs",),
     ("bench",),
     ("cli", "__init__"),
+    ("foxglove",),
     ("sumo",),
     ("mrclam",),
     ("cars",),
@@ -81,7 +82,7 @@ def test_imports_point_downwards(imports: dict[str, set[str]]) -> None:
     assert not upwards, upwards
 
 
-GUESTS = ("cars", "mrclam", "sumo")
+GUESTS = ("cars", "foxglove", "mrclam", "sumo")
 """Rooms that come in through entry points of `pyproject.toml` alone."""
 
 

@@ -33,6 +33,7 @@ from coopenv.backends.mcap_format import (
 from coopenv.base.errors import DataError, OutputError, check_memory, shown
 from coopenv.base.files import check_file, replacing_file
 from coopenv.base.installation import version
+from coopenv.base.plugins import loaded, offered
 from coopenv.base.sections import validated
 from coopenv.observers.arrays import ARRAYS, sizes_of
 from coopenv.observers.contract import Setup
@@ -169,13 +170,21 @@ def _header(container: Container, where: str) -> RecordingHeader:
     return validated(RecordingHeader, attachments[ATTACHMENT], f"{where}: {ATTACHMENT}", DataError)
 
 
+def log_views() -> dict[str, Any]:
+    """Return modules that write the views of logs for other programs, by the program's name.
+
+    They are the entry points `coopenv.views`; `coopenv.foxglove.log_views` shows which functions a module has.
+    """
+    return {name: loaded(point, "view") for name, point in offered("coopenv.views").items()}
+
+
 def write_recording(recording: Recording, path: str | Path, *, views: Sequence[View] = (), start: float = 0.0) -> None:
     """Write every tick of a recording to a file, which is replaced; `read_recording` gives it back bit for bit.
 
     Args:
         recording: what is read back.
         path: of the file.
-        views: further topics for viewers, such as `coopenv.viz.foxglove.views` makes.
+        views: further topics for viewers, such as those of `log_views` make.
         start: s since 1970, time of tick 0, for the stamps alone.
 
     Raises:

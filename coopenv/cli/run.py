@@ -231,15 +231,15 @@ def record(given: RecordOptions) -> None:
 
 def check_log(out: Path, observer: str | None, scene: bool) -> None:
     """Refuse before any work a log that cannot be written. Raises CoopenvError: its path, the observer, or no SDK."""
-    from coopenv.backends.mcap import check_target
+    from coopenv.backends.mcap import check_target, log_views
     from coopenv.observers.registry import find, named
-    from coopenv.viz.foxglove import check_installed
 
     check_target(out)
     if not scene and observer is not None:
         raise CoopenvError(f"--observer {observer}: is for a scene, --no-scene has none")
     if scene:
-        check_installed()
+        for program in log_views().values():
+            program.check_installed()
     if observer is not None:
         find(named(observer))
 
@@ -311,10 +311,10 @@ def export(
 
 
 def _export_layout(log: Path, out: Path) -> None:
+    from coopenv.backends.mcap import log_views
     from coopenv.backends.mcap_format import codec, reading
     from coopenv.base.errors import DataError
     from coopenv.base.files import replace_text
-    from coopenv.viz.foxglove import layout_text
 
     codec()
     from coopenv.backends.mcap_container import Container
@@ -325,5 +325,5 @@ def _export_layout(log: Path, out: Path) -> None:
         topics = Container(log).topics()
     if "/scene/world" not in topics:
         raise DataError(f"{log}: has no scene, `coopenv record --scene` writes one")
-    replace_text(out, layout_text(topics))
+    replace_text(out, log_views()["foxglove"].layout_text(topics))
     options.console().print(f"{out}: import it in Foxglove or Lichtblick (Layouts, Import from file)", soft_wrap=True)

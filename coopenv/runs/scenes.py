@@ -15,7 +15,7 @@ from rich.console import Console
 
 from coopenv.api.engine import Engine
 from coopenv.backends.base import Backend
-from coopenv.backends.mcap import write_recording
+from coopenv.backends.mcap import log_views, write_recording
 from coopenv.backends.registry import kind_of
 from coopenv.backends.selection import WHOLE, Selection
 from coopenv.backends.sources import open_backend
@@ -221,7 +221,7 @@ def observer_of(recording: Recording) -> str:
 
 
 def write_log(recording: Recording, path: Path, log: Console, observer: str | None = None, scene: bool = True) -> None:
-    """Write a recording to a file; with a scene, also Foxglove's view of it and of an observer's estimates.
+    """Write a recording to a file; with a scene, also the views of other programs, with an observer's estimates.
 
     Stamps are those of the wall clock: tick 0 is now.
 
@@ -236,15 +236,14 @@ def write_log(recording: Recording, path: Path, log: Console, observer: str | No
         CoopenvError: no such observer, or it fails on the recording, or the file cannot be written.
     """
     start = time.time()
-    shown = []
+    shown: list[Any] = []
     if scene:
-        from coopenv.viz.foxglove import views
-
         name = named(observer or observer_of(recording))
         with Progress(log, f"estimating with {name}"):
             result = run(name, recording)
         if result.failure:
             raise CoopenvError(f"observer {name} failed: {result.failure}; --no-scene writes the recording alone")
-        shown = views(recording, result, start=start, gain=not states_covariance(name))
+        for program in log_views().values():
+            shown += program.views(recording, result, start=start, gain=not states_covariance(name))
     with Progress(log, f"writing {path.name}"):
         write_recording(recording, path, views=shown, start=start)

@@ -42,7 +42,7 @@ def views(recording: Recording, run: Run, *, start: float = 0.0, gain: bool = Fa
     """
     check_installed()
     from coopenv.backends.mcap_format import LogClock
-    from coopenv.viz.foxglove_messages import RunView, topics
+    from coopenv.foxglove.messages import RunView, topics
 
     return topics(RunView(recording, run, LogClock(recording.dt, start), gain))
 

@@ -62,7 +62,7 @@ def xyz(point: Any) -> list[float]:
 
 
 def written(recording: Recording, observer: str, path: Path) -> tuple[Run, Log]:
-    from coopenv.viz.foxglove import views
+    from coopenv.foxglove.log_views import views
 
     result = run(observer, recording)
     write_recording(recording, path, views=views(recording, result, start=START), start=START)
@@ -248,7 +248,7 @@ def test_what_is_shown_costs_little(crossing: Any) -> None:
 
 def test_gain_matrices_are_no_covariances(tmp_path: Path) -> None:
     from coopenv.backends.mcap_format import codec
-    from coopenv.viz.foxglove import views
+    from coopenv.foxglove.log_views import views
 
     made, path = simulated("crossing_path", horizon=22.0), tmp_path / "gain.mcap"
     shown = views(made, run("riccati", made), gain=True)

@@ -1,0 +1,1 @@
+"""Views of logs for Foxglove and Lichtblick."""
