@@ -42,6 +42,12 @@ MOST_STARTS, MOST_CORNERS = 500_000, 1_000_000
 READ = "coopenv.load_scenario reads one by name, from a file or from a dict"
 
 
+if TYPE_CHECKING:
+    Simulator = str
+else:
+    Simulator = Literal[("simulated", *COSIMULATORS)]
+
+
 class Map(Section):
     """The frame in which vehicles know the landmarks."""
 
@@ -70,7 +76,7 @@ class Scenario(Section, metaclass=_Loaded):
     """Source of the numbers."""
     horizon: Annotated[Positive, EPISODE]
     """Length of an episode, s."""
-    backend: Literal["simulated", "highway", "sumo", "program"] = "simulated"
+    backend: Simulator = "simulated"
     """Simulator that moves the vehicles: coopenv itself, or a co-simulator with the section of this name."""
     highway: Highway | None = None
     sumo: Sumo | None = None
