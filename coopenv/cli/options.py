@@ -276,10 +276,11 @@ class Grouped(TyperGroup):
         """Return the command that the arguments begin with."""
         name = args[0]
         if self.get_command(ctx, name) is None:
+            known = self.list_commands(ctx)
             runs = f"; an environment runs with: coopenv run {name}" if name in list_envs() else ""
             options = [option for parameter in self.get_params(ctx) for option in parameter.opts]
-            near = f" (did you mean '--{name}'?)" if f"--{name}" in options else suggest(name, self.commands)
-            raise CoopenvError(f"no such command: {shown(name)}{near}; known: {listed([*self.commands], 40)}{runs}")
+            near = f" (did you mean '--{name}'?)" if f"--{name}" in options else suggest(name, known)
+            raise CoopenvError(f"no such command: {shown(name)}{near}; known: {listed(known, 40)}{runs}")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: typer.Context, formatter: Any) -> None:  # type: ignore[override]

@@ -24,21 +24,25 @@ class Extended(options.Grouped):
     @property
     def commands(self) -> MutableMapping[str, Any]:
         """All commands by name; the help of one that cannot be loaded gives the reason."""
-        for name in offered(GROUP):
-            try:
-                self.get_command(None, name)
-            except CoopenvError as error:
-                self._known[name] = TyperCommand(name, help=str(error), callback=None)
-        return self._known
+        return {name: self.get_command(None, name) for name in self.list_commands(None)}
 
     @commands.setter
     def commands(self, known: MutableMapping[str, Any]) -> None:
         self._known = known
 
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of all commands, of which none is loaded."""
+        return list(dict.fromkeys([*self._known, *offered(GROUP)]))
+
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command, None if there is none. Raises CoopenvError: it cannot be loaded."""
+        """Return a command, None if there is none. Raises CoopenvError: it is to be run and cannot be loaded."""
         if cmd_name not in self._known and (point := own(GROUP).get(cmd_name) or offered(GROUP).get(cmd_name)):
-            self._known[cmd_name] = _made(point)
+            try:
+                self._known[cmd_name] = _made(point)
+            except CoopenvError as error:
+                if ctx is not None and not ctx.resilient_parsing:
+                    raise
+                return TyperCommand(cmd_name, help=str(error), callback=None)
         return self._known.get(cmd_name)
 
 

@@ -57,7 +57,7 @@ def test_commands_of_another_package_are_listed_and_run(capsys: pytest.CaptureFi
     [
         ("absent", "error: command 'absent' (no_such_one:run) cannot be loaded: ModuleNotFoundError"),
         ("wrong", "error: command 'wrong': expected a function or a typer.Typer, got 3"),
-        ("nosuch", "error: no such command: 'nosuch'; known: list, "),
+        ("gret", "error: no such command: 'gret' (did you mean 'greet'?); known: list, "),
     ],
 )
 def test_a_broken_command_is_one_line(command: str, why: str, capsys: pytest.CaptureFixture[str]) -> None:
