@@ -32,7 +32,7 @@ from coopenv.bench.observers.sources import SimulatedRecords, find_source
 from coopenv.bench.observers.tables import mean_of, short_name
 from coopenv.estimation.metrics import DIVERGED_POSITION
 from coopenv.observers.isolation import Isolated, load
-from coopenv.observers.registry import ZOO, check_known, find, list_observers
+from coopenv.observers.registry import check_known, find, list_observers, zoo
 from coopenv.runs.console import number_table
 
 FOLDER = Path(__file__).parent
@@ -132,7 +132,7 @@ class Frozen:
         """Return the content of the result file of observers in some scenes, all without names."""
         scenes, share, executor = self.scenes(names), self.definition["steady_from"], Local(jobs, limits)
         chosen = _by_name(observers)
-        own = {name: observer for name, observer in chosen.items() if name not in ZOO}
+        own = {name: observer for name, observer in chosen.items() if name not in zoo()}
         loaded = dict(zip(own, check_imports(executor, [*own.values()], load), strict=True))
         files = {name: digest for name, (_, digest) in loaded.items()}
         sent = {name: Isolated(observer) if name in own else observer for name, observer in chosen.items()}
@@ -174,7 +174,7 @@ class Frozen:
         for row in self.zoo["rows"]:
             least[row["scene"]] = min(row["rmse_m"], least.get(row["scene"], math.inf))
         refused = {}
-        for observer in {row["observer"] for row in rows} - ZOO.keys():
+        for observer in {row["observer"] for row in rows} - zoo().keys():
             own = [row for row in rows if row["observer"] == observer and not row["failure"]]
             if (anees := median_of(row["anees_median"] for row in own)) is not None and anees < LEAST_ANEES:
                 why = f"ANEES {anees:.2g} is below {LEAST_ANEES:g}: state a smaller covariance, or none"
