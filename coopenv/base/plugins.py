@@ -9,6 +9,7 @@ import tomllib
 from functools import cache
 from importlib import metadata
 from importlib.metadata import EntryPoint
+from itertools import islice
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
@@ -52,7 +53,7 @@ def _own() -> list[EntryPoint]:
     clone = Path(__file__).resolve().parents[2] / "pyproject.toml"
     project = tomllib.loads(clone.read_text(encoding="utf-8")).get("project", {}) if clone.is_file() else {}
     if project.get("name") != "coopenv":
-        return [point for found in metadata.distributions(name="coopenv") for point in found.entry_points]
+        return [point for found in islice(metadata.distributions(name="coopenv"), 1) for point in found.entry_points]
     groups = project["entry-points"].items()
     return [EntryPoint(name, value, group) for group, points in groups for name, value in points.items()]
 
