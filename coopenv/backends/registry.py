@@ -7,6 +7,7 @@ the table before any of the simulation is loaded.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -137,6 +138,7 @@ def kind_of(name: ScenarioLike | Recording, topics: str | Path | None = None) ->
         return ENVIRONMENT
     first = text.partition(":")[0]
     for entry, kind in {**kinds(first), "": LOG}.items():
-        if kind.claims(text, topics) if kind.claims else entry == first:
-            return kind
+        with suppress(Exception):  # of another package's code: names of other kinds are not affected
+            if kind.claims(text, topics) if kind.claims else entry == first:
+                return kind
     return ENVIRONMENT

@@ -54,7 +54,7 @@ SVEA = SourceKind(
 )
 BAG = SourceKind(
     title="a ROS bag",
-    opener="coopenv.cars.bags.bag:open_bag",
+    opener="coopenv.cars.bags.bag:open_bags",
     claims=is_bag,
     options=("topics", "selection"),
     recorded=True,

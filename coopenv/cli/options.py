@@ -163,8 +163,6 @@ FigureWidth = Annotated[
     ),
 ]
 _source = partial(typer.Argument, **ENVIRONMENT)
-deployment = partial(typer.Argument, metavar="DEPLOYMENT.toml", callback=existing("deployment"))
-bags = partial(typer.Argument, metavar="BAG...", callback=existing("bag"))
 Environment = Annotated[
     str,
     _source(metavar="ENV", help="Name of an environment (see `coopenv list`), a scene (lane:20) or a TOML file."),
@@ -216,26 +214,6 @@ TopicMap = Annotated[
 Connect = Annotated[
     str | None,
     typer.Option(help="Endpoint of the network in place of the deployment's network.connect.", show_default=False),
-]
-GateConnect = Annotated[
-    str | None,
-    typer.Option(
-        help="Router of the car's zenoh-bridge-ros2dds, in place of the deployment's gate.connect "
-        "[default: tcp/127.0.0.1:7447].",
-        show_default=False,
-    ),
-]
-OffBoard = Annotated[
-    bool,
-    typer.Option("--off-board", help="Allow a router that is not on this computer, for trials beside a car."),
-]
-Station = Annotated[
-    str | None,
-    typer.Option(
-        help="Station whose commands the car obeys [default: the deployment's security.identity, or station]; the car "
-        "itself where `coopenv svea run --car` drives it.",
-        show_default=False,
-    ),
 ]
 ObserverName = Annotated[
     str | None,

@@ -23,6 +23,7 @@ TWIN = SourceKind(title="a twin", opener="twin:open_twin", options=("variant",))
 FILES = SourceKind(
     title="a file of ours", opener="twin:nothing", claims=lambda name, topics: name.endswith(".ours"), recorded=True
 )
+ODD = SourceKind(title="odd", claims=lambda name, topics: 1 / 0)
 
 
 def open_twin(name, overrides, variant="facade"):
@@ -30,7 +31,13 @@ def open_twin(name, overrides, variant="facade"):
         raise RuntimeError("no link")
     return Simulated(load_scenario(variant, {"horizon": 1.0, **overrides}))
 """
-POINTS = {"twin": "twin:TWIN", "files": "twin:FILES", "absent": "no_such_module:KIND", "other": "twin:open_twin"}
+POINTS = {
+    "twin": "twin:TWIN",
+    "files": "twin:FILES",
+    "absent": "no_such_module:KIND",
+    "other": "twin:open_twin",
+    "odd": "twin:ODD",
+}
 
 
 @pytest.fixture

@@ -219,27 +219,18 @@ def _used(sample: Sample) -> int:
     return sample.stamp - AHEAD if sample.role is Role.TRUTH else sample.stamp
 
 
-def open_bag(
-    name: str | Path,
+def open_bags(
+    names: str | Path | Sequence[str | Path],
     overrides: Mapping[str, Any] | None = None,
     topics: str | Path | None = None,
     selection: Selection = WHOLE,
 ) -> Bag:
-    """Return a ROS bag as a backend; arguments and errors as for `coopenv.backends.sources.open_backend`."""
-    return open_bags([name], topics, overrides, selection)
-
-
-def open_bags(
-    names: Sequence[str | Path],
-    topics: str | Path | None,
-    overrides: Mapping[str, Any] | None = None,
-    selection: Selection = WHOLE,
-) -> Bag:
-    """Return ROS bags of one drive as a backend; arguments and errors as for `open_bag`."""
-    where = ", ".join(str(name) for name in names)
-    missing = [str(name) for name in names if not Path(name).exists()]
+    """Return ROS bags of one drive as a backend; arguments and errors as for `open_backend`."""
+    paths = [names] if isinstance(names, str | Path) else names
+    where = ", ".join(str(path) for path in paths)
+    missing = [str(path) for path in paths if not Path(path).exists()]
     if missing:
         raise DataError(f"no such bag: {', '.join(missing)}")
     if topics is None:
         raise DataError(f"{where}: a ROS bag, which needs a map of its topics, --map topics.toml (see docs/bags.md)")
-    return Bag(names, topics, overrides, selection.start or 0.0, selection.until, selection.robots)
+    return Bag(paths, topics, overrides, selection.start or 0.0, selection.until, selection.robots)

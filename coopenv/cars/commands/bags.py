@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,9 +19,11 @@ if TYPE_CHECKING:
     from coopenv.cars.bags.topics import TopicRow
     from coopenv.cars.calibration import Calibrated, ConstantRow
 
+in_bags = partial(typer.Argument, metavar="BAG...", callback=options.existing("bag"))
+
 
 def import_(
-    bags: Annotated[list[Path], options.bags(help="Bags of one drive, such as one per car.")],
+    bags: Annotated[list[Path], in_bags(help="Bags of one drive, such as one per car.")],
     topics: options.TopicMap = None,
     out: Annotated[Path | None, typer.Option(help="MCAP file to write, a recording of coopenv.")] = None,
     seed: options.Seed = 0,
@@ -69,7 +72,7 @@ def import_(
     if out is not None:
         check_log(out, observer, scene)
         check_new(out, force)
-    bag = open_bags(bags, topics, options.parse_overrides(overrides))
+    bag = open_bags(bags, options.parse_overrides(overrides), topics)
     _print_topics(bag.log.rows, as_json)
     ticks = bag.capabilities.ticks or 0
     seconds = (ticks - 1) / bag.scenario.rates.camera
@@ -118,9 +121,7 @@ def _print_topics(rows: Sequence[TopicRow], as_json: bool) -> None:
 
 
 def calibrate(
-    bags: Annotated[
-        list[Path], options.bags(metavar="BAG...|FILE.mcap", help="Bags of one drive, or a log of coopenv.")
-    ],
+    bags: Annotated[list[Path], in_bags(metavar="BAG...|FILE.mcap", help="Bags of one drive, or a log of coopenv.")],
     topics: options.TopicMap = None,
     out: Annotated[Path, typer.Option(help="Folder of calibration.toml and the figures.")] = Path("out", "calibration"),
     overrides: options.Overrides = None,
@@ -142,7 +143,7 @@ def calibrate(
     with new_folder(out):
         check_file(out / "calibration.toml")
         if topics is not None:
-            drive = drive_of_bag(open_bags(bags, topics, options.parse_overrides(overrides)))
+            drive = drive_of_bag(open_bags(bags, options.parse_overrides(overrides), topics))
         elif overrides:
             raise CoopenvError("--override: needs the map of the bags' topics, --map topics.toml")
         elif len(bags) > 1 or not kind_of(bags[0]).reader:
@@ -175,7 +176,7 @@ def _print_calibrated(result: Calibrated, files: Sequence[Path]) -> None:
 
 
 def identify(
-    bags: Annotated[list[Path], options.bags(help="Bags of one drive, with the commands.")],
+    bags: Annotated[list[Path], in_bags(help="Bags of one drive, with the commands.")],
     topics: options.TopicMap = None,
     car: Annotated[str | None, typer.Option(help="Name of the car (default: the first one with commands).")] = None,
     out: Annotated[Path, typer.Option(help="File of the result.")] = Path("identified.toml"),
@@ -194,7 +195,7 @@ def identify(
     from coopenv.runs.console import Progress, number_table
 
     check_file(out)
-    bag = open_bags(bags, topics, options.parse_overrides(overrides))
+    bag = open_bags(bags, options.parse_overrides(overrides), topics)
     with Progress(options.console(stderr=True), "identifying"):
         result = identified(bag, car)
     replace_text(out, toml_text(result))

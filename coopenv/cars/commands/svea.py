@@ -21,6 +21,28 @@ from coopenv.cli import options
 if TYPE_CHECKING:
     from coopenv.cars.transport import Transport
 
+in_deployment = partial(typer.Argument, metavar="DEPLOYMENT.toml", callback=options.existing("deployment"))
+GateConnect = Annotated[
+    str | None,
+    typer.Option(
+        help="Router of the car's zenoh-bridge-ros2dds, in place of the deployment's gate.connect "
+        "[default: tcp/127.0.0.1:7447].",
+        show_default=False,
+    ),
+]
+OffBoard = Annotated[
+    bool,
+    typer.Option("--off-board", help="Allow a router that is not on this computer, for trials beside a car."),
+]
+Station = Annotated[
+    str | None,
+    typer.Option(
+        help="Station whose commands the car obeys [default: the deployment's security.identity, or station]; the car "
+        "itself where `coopenv svea run --car` drives it.",
+        show_default=False,
+    ),
+]
+
 svea = options.group("SVEA cars, real ones and fakes.")
 HARMED = 1
 """Exit status of an attack that got through."""
@@ -73,7 +95,7 @@ def demo(
 
 @svea.command()
 def fake(
-    deployment: Annotated[Path, options.deployment(help="Deployment of the fleet.")],
+    deployment: Annotated[Path, in_deployment(help="Deployment of the fleet.")],
     car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
     seed: options.Seed = 0,
     fault: Annotated[
@@ -87,7 +109,7 @@ def fake(
     ] = None,
     connect: options.Connect = None,
     gate: Annotated[bool, typer.Option(help="Use a gate for commands; otherwise the fake obeys ManualControl.")] = True,
-    station: options.Station = None,
+    station: Station = None,
 ) -> None:
     """Let a fake car drive, see and send until it is interrupted; a line marks when it is ready."""
     from coopenv.base import interrupts
@@ -121,12 +143,12 @@ def gate(
         Path | None,
         typer.Argument(metavar="[DEPLOYMENT.toml]", help="Deployment with [gate], keys and limits; options win."),
     ] = None,
-    connect: options.GateConnect = None,
-    off_board: options.OffBoard = False,
+    connect: GateConnect = None,
+    off_board: OffBoard = False,
     keys: Annotated[
         Path | None, typer.Option(help="Folder with CAR.pem and public.toml of `coopenv svea keys`.")
     ] = None,
-    station: options.Station = None,
+    station: Station = None,
     max_speed: Annotated[float | None, Speed] = None,
     max_steering: Annotated[float | None, Angle] = None,
     max_acceleration: Annotated[float | None, Acceleration] = None,
@@ -166,10 +188,10 @@ def gate(
 
 @svea.command()
 def health(
-    deployment: Annotated[Path, options.deployment(help="Deployment of the fleet.")],
+    deployment: Annotated[Path, in_deployment(help="Deployment of the fleet.")],
     car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
-    connect: options.GateConnect = None,
-    off_board: options.OffBoard = False,
+    connect: GateConnect = None,
+    off_board: OffBoard = False,
     patience: Annotated[float, typer.Option(min=0.1, help="Longest wait for it, s.")] = 2.0,
     clocks: Annotated[
         float | None,
@@ -253,10 +275,10 @@ def next_message(transport: "Transport", topic: str, kind: str, patience: float)
 
 @svea.command()
 def see(
-    deployment: Annotated[Path, options.deployment(help="Deployment of the fleet.")],
+    deployment: Annotated[Path, in_deployment(help="Deployment of the fleet.")],
     car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
-    connect: options.GateConnect = None,
-    off_board: options.OffBoard = False,
+    connect: GateConnect = None,
+    off_board: OffBoard = False,
     patience: Annotated[float, typer.Option(min=0.1, help="Longest wait for the calibration of its camera, s.")] = 5.0,
 ) -> None:
     """Find the tags in a car's frames, the topic `detections`, and publish their bearings, until it is interrupted.
@@ -347,7 +369,7 @@ def router(
 
 @svea.command()
 def attack(
-    deployment: Annotated[Path, options.deployment(help="A fleet at a stand.")],
+    deployment: Annotated[Path, in_deployment(help="A fleet at a stand.")],
     commands: Annotated[int, typer.Option(min=1, help="Messages of all kinds together, at least.")] = 10_000,
     host: Annotated[
         list[str] | None, typer.Option(help="Address of a car, to scan for open ports. Repeatable.")
@@ -397,7 +419,7 @@ def attack(
 class SveaRunOptions:
     """Options of `coopenv svea run`."""
 
-    config: Annotated[Path, options.deployment(help="Cars and their network.")]
+    config: Annotated[Path, in_deployment(help="Cars and their network.")]
     car: Annotated[
         str | None,
         typer.Option(help="Estimate and drive only this car, receive from others (default: all, as an edge server)."),
