@@ -20,4 +20,3 @@ def install(
     ]
     (metadata / "entry_points.txt").write_text("\n".join(lines), encoding="utf-8")
     monkeypatch.syspath_prepend(str(folder))
-    monkeypatch.delitem(__import__("sys").modules, name, raising=False)
