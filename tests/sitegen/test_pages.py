@@ -56,7 +56,7 @@ def test_pages_of_observers_say_where_they_come_from(made: dict[str, str]) -> No
     for name, entry in zoo().items():
         page = made[f"reference/observers/{name}_.md"]
         place, _, item = entry.plugin.partition(":")
-        assert f"::: coopenv.observers.{place}.{item}" in page and "## Method and source" in page
+        assert f"::: {entry.package}.{place}.{item}" in page and "## Method and source" in page
         assert "<" not in page.partition("## Method and source")[2]  # Markdown's escape of it is none
         assert ("inside the kernels" in page) == bool(entry.kernels)
     assert "Runs in kernels on the CPU that the host calls" in made["reference/observers/hamel_samson_.md"]
