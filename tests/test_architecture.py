@@ -105,23 +105,26 @@ def test_a_class_name_means_one_class() -> None:
 LINES_AND_FILES = {
     ".": (129, 2),
     "api": (4126, 16),
-    "backends": (4079, 15),
-    "base": (2341, 12),
-    "bench": (5780, 19),
-    "cars": (12039, 48),
-    "cli": (2749, 9),
+    "backends": (3058, 13),
+    "base": (2412, 13),
+    "bench": (5748, 19),
+    "cars": (13169, 54),
+    "cli": (2111, 8),
     "estimation": (1922, 7),
     "evaluation": (575, 3),
-    "observers": (11835, 43),
+    "foxglove": (460, 3),
+    "mrclam": (2145, 11),
+    "observers": (10378, 38),
     "policies": (2121, 10),
-    "runs": (3658, 13),
-    "scenario": (3987, 13),
+    "runs": (3372, 12),
+    "scenario": (3673, 12),
+    "sumo": (811, 4),
     "training": (1797, 7),
-    "viz": (4947, 17),
-    "world": (5634, 18),
+    "viz": (4433, 15),
+    "world": (5631, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
-MOST_FILES = 252
+MOST_FILES = 265
 
 
 def test_wings_keep_their_budgets() -> None:

@@ -44,7 +44,7 @@ class Unit:
     def read(self, given: Any, checked: Callable[[Any], Any]) -> Any:
         """Return a number or a text with a unit, `checked`. Raises ValueError: its unit or its number is refused."""
         (likely, sizes), number = UNITS[self.symbol], given
-        if isinstance(given, str) and (found := _TEXT.fullmatch(given)):
+        if given.__class__ is str and (found := _TEXT.fullmatch(given)):
             if found[2] not in sizes:
                 raise ValueError(f"{given!r} has no unit of this key; allowed: {', '.join(sizes)}")
             number = float(found[1]) * sizes[found[2]]
@@ -57,9 +57,10 @@ class Unit:
 
     def doubt(self, value: float, factor: float = 1.0) -> str:
         """Return why a number is implausible, and the likely mistake, or nothing; `factor` widens the range."""
-        if value == 0.0 or self.least <= abs(value) <= self.most * factor:
+        most = self.most * factor
+        if -most <= value <= most and (not self.least or value == 0.0 or abs(value) >= self.least):
             return ""
-        expected = f"{self.least:g} to {self.most * factor:.5g}"
+        expected = f"{self.least:g} to {most:.5g}"
         return f"{value:.6g} {self.symbol} is implausible (expected magnitude {expected}): {UNITS[self.symbol][0]}"
 
     def holds_for(self, numbers: tuple[Any, ...]) -> bool:
@@ -101,10 +102,10 @@ Loss = Annotated[float, Field(ge=0.0, lt=1.0), CHANCE]
 
 
 @cache
-def units_of(model: type[BaseModel]) -> dict[str, Unit]:
-    """Return the unit of every field of a section that has one."""
+def units_of(model: type[BaseModel]) -> dict[str, Unit | None]:
+    """Return the unit of every field of a section; None: it has none."""
     fields = model.model_fields.items()
-    return {name: part for name, info in fields for part in info.metadata if isinstance(part, Unit)}
+    return {name: next((part for part in info.metadata if isinstance(part, Unit)), None) for name, info in fields}
 
 
 def warn_of_implausible(model: BaseModel, factors: Mapping[Unit, float], where: str = "") -> None:
@@ -119,16 +120,21 @@ def warn_of_implausible(model: BaseModel, factors: Mapping[Unit, float], where: 
         warnings.warn(line, ScenarioWarning, stacklevel=3)
 
 
+_PLAIN = (str, bool, int, type(None))  # values without parts, which are not judged
+
+
 def _doubts(node: Any, where: str, unit: Unit | None, factors: Mapping[Unit, float]) -> Iterator[tuple[str, str]]:
     """Yield place and doubt of the implausible numbers among those that are given."""
     parts: Any = ()
-    if isinstance(node, BaseModel):
-        units, given = units_of(type(node)), vars(node)
-        parts = [(name, given.get(name), units.get(name)) for name in node.model_fields_set]
-    elif isinstance(node, tuple) and (unit is None or not unit.holds_for(node)):
-        parts = [(i, part, unit) for i, part in enumerate(node)]
-    elif unit is not None and isinstance(node, float) and (doubt := unit.doubt(node, factors.get(unit, 1.0))):
-        yield where, doubt
+    kind = node.__class__  # compared without calls, because a city has thousands of values
+    if kind is float:
+        if unit is not None and (doubt := unit.doubt(node, factors.get(unit, 1.0))):
+            yield where, doubt
+    elif kind is tuple:
+        parts = () if unit is not None and unit.holds_for(node) else [(i, part, unit) for i, part in enumerate(node)]
+    elif isinstance(node, BaseModel):
+        units, given = units_of(kind), vars(node)
+        parts = [(name, given[name], units[name]) for name in node.model_fields_set if name in units]
     for name, part, own in parts:
-        if own is not None or not isinstance(part, str):
+        if part.__class__ not in _PLAIN:
             yield from _doubts(part, f"{where}.{name}", own, factors)

@@ -108,7 +108,7 @@ class Rollout:
         if lost:
             name, vehicle = self.scenario.observer.name, self.scenario.vehicle_names[lost[0]]
             time = tick / self.scenario.rates.camera
-            raise CoopenvError(f"observer '{name}' of {vehicle} at {time:.3f} s: its estimate is not finite")
+            raise CoopenvError(f"observer '{name}' at {vehicle} at {time:.3f} s: its estimate is not finite")
 
     def _recorded(self, name: str) -> np.ndarray:
         """Return (K, ...) of one view."""

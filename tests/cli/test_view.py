@@ -141,7 +141,8 @@ def test_without_a_display_no_browser_is_opened(
     opened: list[str] = []
     monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or len(opened) == 1)
     capsys.readouterr()
-    for said in ("", "note: there is no browser to open there/replay.html\n"):
+    overwritten = "overwrites seed 0 in there\n"
+    for said in (overwritten, f"{overwritten}note: there is no browser to open there/replay.html\n"):
         assert main(["run", "crossing_path", *SHORT[1:], "--out", "there", "--open"]) == 0
         assert capsys.readouterr().err == said
     assert opened == 2 * [(Path.cwd() / "there" / "replay.html").as_uri()]

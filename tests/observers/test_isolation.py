@@ -139,7 +139,7 @@ class Faulty:
 
 class Babbles(Faulty):
     def update(self, tick):
-        for n in range(3, 20):
+        for n in range(3, 256):
             try:
                 os.write(n, bytes(3) + b"\\7garbage")
             except OSError:
@@ -179,7 +179,7 @@ def test_failures_are_one_line(two: Recording, tmp_path: Path, capfd: pytest.Cap
 def test_answers_that_cannot_be_read_end_the_process(two: Recording, tmp_path: Path, name: str, why: str) -> None:
     (tmp_path / "mine.py").write_text(FAULTY)
     failure = apart(f"{tmp_path / 'mine.py'}:{name}", two).failure
-    assert re.fullmatch(f"of vehicle_1 at [0-9.]+ s: {why}; its process ended with SIGKILL", failure)
+    assert re.fullmatch(f"at vehicle_1 at [0-9.]+ s: {why}; its process ended with SIGKILL", failure)
 
 
 def test_an_observer_that_ends_while_it_is_loaded_is_named(tmp_path: Path) -> None:

@@ -111,7 +111,7 @@ def test_a_failed_run_is_kept_and_fails_again(
     assert manifest["state_tick"] == 30 and manifest["end"]["tick"] == 75 and str(folder) not in str(manifest)
     capsys.readouterr()
     assert main(["run", "report.zip"]) == 0
-    assert "Late' of vehicle_1" in (printed := capsys.readouterr().out) and reason in printed
+    assert "Late' at vehicle_1" in (printed := capsys.readouterr().out) and reason in printed
     (folder / "mine.py").write_text(OBSERVER.replace("VERDICT", "pass"))
     assert "report.zip: needs its code/mine.py here as mine.py" in refused("run", "report.zip")
 

@@ -178,7 +178,7 @@ def test_figures_have_the_digits_that_their_interval_allows(values: tuple[float,
 
 def test_in_python_it_prints_tables_and_names_what_is_wrong() -> None:
     found = coopenv.evaluate("facade", "own.py:still", worlds=np.int64(2), overrides={"horizon": 1.0})
-    assert "2 held-out worlds" in str(found) and "few: share of that time" in str(found)
+    assert "2 held-out worlds" in str(found) and "few: share of the time" in str(found)
     assert repr(found).startswith("Evaluation('facade'")
     with pytest.raises(coopenv.CoopenvError, match=r"worlds must be a whole number, got 2\.5"):
         coopenv.evaluate("facade", "peek", worlds=2.5)  # type: ignore[arg-type]

@@ -97,7 +97,7 @@ def test_failures_are_counted_and_reported() -> None:
     assert 0 < 2 * raises.failed == len(failures) < 12 and raises.failure == failures[0]
     assert (mekf.failed, mekf.failure) == (0, "")
     (line,) = basin_failures([raises, mekf])
-    assert line.startswith(f"raises (basin): failed in {raises.failed} of 6 draws, first of vehicle_")
+    assert line.startswith(f"raises (basin): failed in {raises.failed} of 6 draws, first at vehicle_")
     assert "ZeroDivisionError" in line
     assert {draw.failure for draw in draws if draw.observer == "mekf"} == {""}
     assert printed(basin_table([raises, mekf])).splitlines()[3].split()[:3] == ["raises", "6", str(raises.failed)]
