@@ -57,10 +57,9 @@ class Unit:
 
     def doubt(self, value: float, factor: float = 1.0) -> str:
         """Return why a number is implausible, and the likely mistake, or nothing; `factor` widens the range."""
-        most = self.most * factor
-        if -most <= value <= most and (not self.least or value == 0.0 or abs(value) >= self.least):
+        if value == 0.0 or self.least <= abs(value) <= self.most * factor:
             return ""
-        expected = f"{self.least:g} to {most:.5g}"
+        expected = f"{self.least:g} to {self.most * factor:.5g}"
         return f"{value:.6g} {self.symbol} is implausible (expected magnitude {expected}): {UNITS[self.symbol][0]}"
 
     def holds_for(self, numbers: tuple[Any, ...]) -> bool:
@@ -128,7 +127,8 @@ def _doubts(node: Any, where: str, unit: Unit | None, factors: Mapping[Unit, flo
     parts: Any = ()
     kind = node.__class__  # compared without calls, because a city has thousands of values
     if kind is float:
-        if unit is not None and (doubt := unit.doubt(node, factors.get(unit, 1.0))):
+        beyond = unit and (unit.least or not -unit.most <= node <= unit.most)
+        if beyond and unit and (doubt := unit.doubt(node, factors.get(unit, 1.0))):
             yield where, doubt
     elif kind is tuple:
         parts = () if unit is not None and unit.holds_for(node) else [(i, part, unit) for i, part in enumerate(node)]
