@@ -339,8 +339,8 @@ def watch(
         stage = live.watch(scenario, policy, seed, log, speed=speed)
     else:
         stage = live.LiveWorld(scenario, log)
+        note_overwritten(out, VIDEO_FILES, log)
         with replacing_folder(out, VIDEO_FILES) as folder, Progress(log, f"filming {video_path(folder).name}"):
-            note_overwritten(out, VIDEO_FILES, log)
             fps = scenario.rates.camera / stage.stride
             write_pictures(video_path(folder), fps, stage.pictures(policy, seed))
     for line in stage.outcomes():

@@ -81,8 +81,8 @@ def execute(
     able = run.engine.backend.capabilities
     paced = scenario.rates.camera if able.real_time and not able.simulated_clock else None
     doing = "replaying" if able.recorded else "driving" if able.real_time else "simulating"
+    lines.note_overwritten(out, result_names(), log)
     with nullcontext() if out is None else replacing_folder(out, result_names()) as folder:
-        lines.note_overwritten(out, result_names(), log)
         with compile_notice(log):
             run.engine.load()
         keeper = Keeper(run.engine, source_of(run.engine, name, run.seed, run.policy_name))
