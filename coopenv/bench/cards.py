@@ -310,7 +310,7 @@ COLUMNS = {
 EXPLANATIONS = {
     "intervals": "95 %, bootstrap over worlds",
     "e50, e95": "median and 95th percentile of the error from 3 s on, of vehicles under way",
-    "lost": f"collided or never arrived; such vehicles count with {LOST:g} m until the horizon, others with no more",
+    "lost": f"collided or never arrived; such vehicles count with {LOST:g} m for the rest of their way, others with no more",
     "score": f"e95 [cm] of the fleet; rankings go by losses in steps of {100 * LOSSES:g} %, then by the score",
     "few": "share of the time from 3 s on with fewer than three targets in view",
     "return": "sum of the rewards of a vehicle",

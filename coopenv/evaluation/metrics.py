@@ -149,22 +149,26 @@ def scored_errors(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the position errors (M,) that a driver is judged by, m, and the world (M,) of each.
 
-    They are the errors of vehicles under way, at most `LOST`, and `LOST` for every decision in which a vehicle is lost
-    (`Episodes.lost_from`). As a lost vehicle counts until the horizon, no crash lowers a percentile.
+    They are the errors of vehicles under way, at most `LOST`, and `LOST` for the rest of the way of every lost vehicle
+    (`Episodes.lost_for`).
 
     Args:
         episodes: the record.
         start: time from which errors count, s.
         vehicles: the driven vehicles that count.
     """
-    decisions, (K, *_) = np.arange(episodes.horizon)[:, None, None], episodes.under_way.shape
-    counted = decisions >= episodes.lost_from
-    error = np.full(counted.shape, LOST, episodes.position_error.dtype)
-    error[:K] = np.where(counted[:K], LOST, np.minimum(episodes.position_error, LOST))
-    counted[:K] |= episodes.under_way
-    counted &= episodes.period * (decisions + 1) >= start - 1e-9
-    counted, error = counted[..., vehicles], error[..., vehicles]
-    return error[counted], np.nonzero(counted)[1]
+    counted = _counted(episodes, start)[..., vehicles]
+    errors = np.minimum(episodes.position_error[..., vehicles][counted], LOST)
+    first = int(np.ceil(start / episodes.period - 1e-6)) - 1
+    early = np.maximum(first - episodes.under_way.sum(axis=0), 0)  # lost before the start
+    lost = np.maximum(episodes.lost_for - early, 0)[:, vehicles].sum(axis=1)
+    worlds = np.concatenate([np.nonzero(counted)[1], np.repeat(np.arange(episodes.worlds), lost)])
+    return np.append(errors, np.full(lost.sum(), LOST, errors.dtype)), worlds
+
+
+def _mean(start: float, episodes: Episodes) -> Statistic:
+    errors, worlds = scored_errors(episodes, start)
+    return Ratio(*(np.bincount(worlds, w, episodes.worlds) for w in (errors, np.ones(len(errors)))))
 
 
 def _quantile(name: str, share: float, start: float, episodes: Episodes) -> Statistic:
@@ -186,6 +190,8 @@ def _errors(quantity: str, unit: str, name: str, prefix: str = "") -> dict[str, 
         for short, share, word in (("e50", 0.5, "Median"), ("e95", 0.95, "95th percentile")):
             meaning = f"{word} of the {quantity} error {span}{lost}"
             found[f"{prefix}{short}{when}_{unit}"] = Metric(meaning, unit, partial(_quantile, name, share, start))
+        if lost:
+            found[f"mean{when}_{unit}"] = Metric(f"Mean of the {quantity} error {span}{lost}", unit, partial(_mean, start))
         meaning = f"Root mean square of the {quantity} error {span}"
         found[f"{prefix}rmse{when}_{unit}"] = Metric(meaning, unit, partial(_rmse, name, start))
     return found

@@ -218,32 +218,36 @@ def test_a_crash_in_place_of_an_arrival_never_improves_the_score(data: st.DataOb
     W = data.draw(st.integers(1, 6))
     errors = data.draw(st.lists(st.floats(0.0, 3.0), min_size=W, max_size=W))
     arrived = np.array([True, *data.draw(st.lists(st.booleans(), min_size=W - 1, max_size=W - 1))])
-    ended = np.array(data.draw(st.lists(st.integers(1, 79), min_size=W, max_size=W)))
+    ended = np.where(arrived, 40, data.draw(st.lists(st.integers(1, 39), min_size=W, max_size=W)))
     before = figures(trips(errors, arrived, ended))
-    crash = np.where(np.arange(W) == 0, data.draw(st.integers(1, int(ended[0]))), ended)
+    crash = np.where(np.arange(W) == 0, data.draw(st.integers(1, 40)), ended)
     after = figures(trips(errors, arrived & (np.arange(W) > 0), crash))
-    for name in ("e50_m", "e95_m", "e50_episode_m", "e95_episode_m"):
+    for name in ("e50_m", "e95_m", "mean_m", "e50_episode_m", "e95_episode_m", "mean_episode_m"):
         assert np.isnan(before[name]) or after[name] >= before[name] - 1e-12, name
     assert ranking_key(before) <= ranking_key(after)
 
 
 def test_an_early_crash_weighs_more_than_a_late_one() -> None:
-    early, late = (trips([0.1] * 20, np.arange(20) > 0, np.where(np.arange(20) > 0, 76, end)) for end in (5, 75))
-    assert early.lost_from[0, 0] == 5 and late.lost_from[0, 0] == 75 and (early.lost_from[1:] == early.horizon).all()
-    lost = [np.mean(scored_errors(driven)[0] == LOST) for driven in (early, late)]
-    assert lost == pytest.approx([75 / (75 + 19 * 71), 5 / (75 + 19 * 71)])
+    """Each on 20 m of which 1 m is driven in a decision, and errors count from the sixth decision on."""
+    early, late = (trips([0.1] * 20, np.arange(20) > 0, np.where(np.arange(20) > 0, 20, e), speed=2.0) for e in (2, 19))
+    assert (early.lost_for[0, 0], late.lost_for[0, 0]) == (18, 1) and (early.lost_for[1:] == 0).all()
+    for driven, lost in ((early, 15), (late, 1)):  # the first three of those 18 are before 3 s
+        values, worlds = scored_errors(driven)
+        assert len(values) == 20 * 15 and (values == LOST).sum() == lost and (worlds[values == LOST] == 0).all()
+        assert figures(driven)["mean_m"] == pytest.approx(0.1 + lost * (LOST - 0.1) / 300)
 
 
-def test_a_vehicle_that_has_not_arrived_at_the_horizon_is_lost_for_the_rest_of_its_route() -> None:
-    standing = trips([0.1], np.array([False]), np.array([80]), speed=0.125)  # 5 of 20 m
-    assert standing.lost_from[0, 0] == 20
-    values, _ = scored_errors(standing, start=0.0)
-    assert len(values) == 80 and (values == LOST).sum() == 60
+def test_a_vehicle_that_has_not_arrived_at_the_horizon_is_lost_for_the_rest_of_its_way() -> None:
+    slow = trips([0.1], np.array([False]), np.array([80]), speed=0.375)  # 15 of 20 m
+    assert slow.lost_for[0, 0] == 27 and (scored_errors(slow, start=0.0)[0] == LOST).sum() == 27
+    standing = trips([0.1], np.array([False]), np.array([80]), speed=0.0)
+    assert standing.lost_for[0, 0] == 80  # at most another episode
     aimless = replace(standing, goal=np.zeros((1, 1), dtype=bool))
-    assert aimless.lost_from[0, 0] == 80 and figures(aimless)["e95_m"] == pytest.approx(0.1)
+    assert aimless.lost_for[0, 0] == 0 and figures(aimless)["e95_m"] == pytest.approx(0.1)
     collided = trips([0.1], np.array([False]), np.array([30]))
-    assert replace(collided, goal=np.zeros((1, 1), dtype=bool)).lost_from[0, 0] == 30
-    assert replace(collided, outcome=-collided.outcome).lost_from[0, 0] == 80  # never there
+    nowhere = np.full_like(collided.route, np.nan)
+    assert replace(collided, goal=np.zeros((1, 1), dtype=bool), route=nowhere).lost_for[0, 0] == 50  # of the episode
+    assert replace(collided, outcome=-collided.outcome).lost_for[0, 0] == 0  # never there
 
 
 def test_the_interval_of_lost_vehicles_is_theirs() -> None:
