@@ -83,7 +83,7 @@ study: $(VENV)/.study ## compare methods of learning, about an hour; goes on whe
 
 test-sumo: $(VENV)/.dev ## the tests that need SUMO (250 MB)
 	@$(PIP) --editable '.[sumo]'
-	@$(BIN)/python -m pytest -k sumo tests/sumo tests/backends tests/test_envs.py
+	@$(BIN)/python -m pytest -k sumo tests/sumo tests/sources tests/test_envs.py
 
 test-all: lint ## every test whose tools are installed
 	@$(BIN)/python -m pytest -n 2 --dist loadfile

@@ -27,12 +27,12 @@ import warp as wp
 
 from benchmarks.options import at_least
 from coopenv.api.engine import Engine
-from coopenv.backends.feed import COSIMULATED, RECORDED
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.files import replace_text
 from coopenv.base.format import json_text
 from coopenv.bench.pages import table
 from coopenv.scenario import load_scenario
+from coopenv.sources.feed import COSIMULATED, RECORDED
 from coopenv.world.launch import Launcher, PerWorld, kernel
 from coopenv.world.model import precision
 from coopenv.world.step import source_kernels

@@ -56,11 +56,11 @@ def patch(share: float, time: float) -> None:
 def measure(point: str, time: float, worlds: int) -> dict[str, list[float]]:
     """Return per scene the range bias, m, its standard error, ANEES of the second vehicle and its standard error."""
     patch(POINTS[point], time)
-    from coopenv.backends.worlds import Simulated
     from coopenv.estimation.metrics import nees
     from coopenv.estimation.poses import Coordinates
     from coopenv.scenario import load_scenario
     from coopenv.scenario.bodies import ConstantMotion
+    from coopenv.sources.worlds import Simulated
 
     found = {}
     for scene, turn in TURNS.items():

@@ -22,7 +22,6 @@ from rich.console import Console
 
 from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import observation_layout
-from coopenv.backends.sources import open_simulation
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers.rows import standard_error
 from coopenv.estimation import Outcome
@@ -32,6 +31,7 @@ from coopenv.policies import Policy, load_agent
 from coopenv.policies.base import decide, restart
 from coopenv.runs.console import Progress, number_table
 from coopenv.scenario import Scenario
+from coopenv.sources.sources import open_simulation
 
 SEARCH = "search"
 AGENTS = ("route_follower", "look_ahead", "team_look_ahead")

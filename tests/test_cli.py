@@ -13,7 +13,6 @@ import pytest
 from matplotlib.image import imread
 
 import coopenv
-from coopenv.backends.mcap import write_recording
 from coopenv.base.installation import environment_id, list_agents
 from coopenv.bench.observers.faults import FAULTS, VARIANTS
 from coopenv.cli.app import failure_status, main
@@ -24,6 +23,7 @@ from coopenv.observers.registry import list_observers
 from coopenv.runs import console
 from coopenv.runs.command import Results
 from coopenv.runs.recorder import record
+from coopenv.sources.mcap import write_recording
 from tests.helpers.commands import refused
 from tests.helpers.env_suite import ALIKE, each_slow
 

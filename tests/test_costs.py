@@ -24,7 +24,6 @@ import numpy as np
 import pytest
 
 from coopenv import CoopenvError, load_scenario
-from coopenv.backends.mcap import read_recording, write_recording
 from coopenv.base.format import read_npz
 from coopenv.base.sections import read_toml
 from coopenv.cars.bags.topic_map import load_map
@@ -34,6 +33,7 @@ from coopenv.observers import Recording
 from coopenv.observers.contract import SensorNoise
 from coopenv.policies.loader import read_card
 from coopenv.runs.bundle import Bundle, Manifest, RunEnd
+from coopenv.sources.mcap import read_recording, write_recording
 from coopenv.sumo import files as sumo_files
 from coopenv.training.settings import read_settings
 from tests.helpers import bags, builders, mrclam_files

@@ -16,12 +16,12 @@ from pathlib import Path
 
 from benchmarks.methods import report, study
 from coopenv.api.engine import Engine
-from coopenv.backends.sources import open_simulation
 from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.base.files import replace_text
 from coopenv.base.installation import install_command, names_of, needing
 from coopenv.evaluation import drive, held_out_seeds, score
 from coopenv.policies import Policy, load_agent
+from coopenv.sources.sources import open_simulation
 
 HERE = Path(__file__).resolve().parent
 

@@ -20,11 +20,11 @@ import numpy as np
 from pydantic import Field
 from scipy.stats import trim_mean
 
-from coopenv.backends.sources import open_simulation
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
 from coopenv.base.sections import Section, read_toml, validated
 from coopenv.evaluation.metrics import interval, ranking_key
+from coopenv.sources.sources import open_simulation
 
 FIGURES = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m", "return")
 """Of the metrics of `coopenv evaluate`, those that are kept."""

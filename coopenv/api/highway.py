@@ -12,12 +12,12 @@ import gymnasium
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.backends.cosimulation import Cosimulated, Moment, Poses, TrafficProgram
-from coopenv.backends.highway import flipped, poses_of
 from coopenv.base.errors import CoopenvError, checked_seed
 from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array, position_covariance
 from coopenv.scenario import Scenario, load_scenario
+from coopenv.sources.cosimulation import Cosimulated, Moment, Poses, TrafficProgram
+from coopenv.sources.highway import flipped, poses_of
 
 LONGEST = 3600.0  # s, of an episode
 

@@ -10,12 +10,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from coopenv.api.arguments import RewardFunction
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.vector_env import ActingRows, ArrayKind, CooperativeVectorEnv
-from coopenv.backends.base import Backend
-from coopenv.backends.sources import open_backend, open_simulation, source_name
 from coopenv.base.errors import CoopenvError, explained
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import with_observer
 from coopenv.scenario import ScenarioLike, scenario_name
+from coopenv.sources.base import Backend
+from coopenv.sources.sources import open_backend, open_simulation, source_name
 
 
 @explained
@@ -50,7 +50,7 @@ def parallel_env(
         observer: estimator that every vehicle runs, embedded or a plug-in: a name, a class, or an import path
             (`mine.py:Mine`, `package.module:Mine`); None: that of the scenario.
         backend: where measurements come from, "simulated", "highway", "replay" or "svea", or a
-            `coopenv.backends.base.Backend`, which has its own scenario; None: by the name.
+            `coopenv.sources.base.Backend`, which has its own scenario; None: by the name.
         observation: "flat" Box or one-level "dict".
         device: "cpu" or a CUDA device.
         dtype: "float32" or "float64" (of the world; observations are float32).

@@ -17,7 +17,6 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
 from coopenv.api.engine import Engine
-from coopenv.backends.sources import open_simulation
 from coopenv.base.columns import WIDTH, Columns, Tabular, one_line, picture_html, terminal_html
 from coopenv.base.errors import ActionError, CoopenvError, check_one_of, checked_seed
 from coopenv.base.files import check_file, replace_text
@@ -30,6 +29,7 @@ from coopenv.policies import Agent, Policy, agents_for, find_agent
 from coopenv.policies.loader import CARD_FILES
 from coopenv.runs.console import number_table
 from coopenv.scenario import Scenario, ScenarioLike, scenario_name
+from coopenv.sources.sources import open_simulation
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -310,7 +310,7 @@ COLUMNS = {
 EXPLANATIONS = {
     "intervals": "95 %, bootstrap over worlds",
     "e50, e95": "median and 95th percentile of the error from 3 s on, of vehicles under way",
-    "lost": f"collided or never arrived; such vehicles count with {LOST:g} m for the rest of their way, others with no more",
+    "lost": f"collided or never arrived: {LOST:g} m for the rest of the way, more than which no error counts",
     "score": f"e95 [cm] of the fleet; rankings go by losses in steps of {100 * LOSSES:g} %, then by the score",
     "few": "share of the time from 3 s on with fewer than three targets in view",
     "return": "sum of the rewards of a vehicle",

@@ -17,7 +17,6 @@ from rich.console import Console
 from rich.table import Table
 
 from coopenv.api.engine import Engine
-from coopenv.backends.sources import open_simulation
 from coopenv.base.errors import CoopenvError, check_one_of, listed
 from coopenv.base.files import replace_text
 from coopenv.base.sections import Section, read_toml, validated
@@ -27,6 +26,7 @@ from coopenv.evaluation import Difference, Episodes, Result, compare_paired, dri
 from coopenv.policies import load_agent
 from coopenv.policies.loader import AGENT_FILE, CHECKPOINT_FILE, read_card
 from coopenv.runs.console import Progress, number_table
+from coopenv.sources.sources import open_simulation
 from coopenv.training.settings import SETTINGS_FILE, TrainingPlan, read_settings
 
 Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from coopenv.backends.worlds import Simulated, SimulatedWorld
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.vision import Calibration, dictionary_of, find_tags, opencv, rays
 from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario
+from coopenv.sources.worlds import Simulated, SimulatedWorld
 from coopenv.world.random import BEARING_NOISE
 from coopenv.world.step import Kernels, source_kernels
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from coopenv.backends.registry import LOG_SUFFIX, SourceKind, no_name
 from coopenv.base.installation import BAGS
+from coopenv.sources.registry import LOG_SUFFIX, SourceKind, no_name
 
 DRIVE_METADATA = "coopenv-drive"
 """Name of the metadata of drives."""
@@ -41,7 +41,7 @@ def is_drive(name: str, topics: str | Path | None = None) -> bool:
 
 
 def _metadata_of(name: str) -> frozenset[str] | None:
-    from coopenv.backends.mcap_format import metadata_names
+    from coopenv.sources.mcap_format import metadata_names
 
     return metadata_names(name)
 
@@ -65,6 +65,6 @@ DRIVE = SourceKind(
     opener="coopenv.cars.backend.drive:Drive",
     claims=is_drive,
     recorded=True,
-    reader="coopenv.backends.sources:read_log",
+    reader="coopenv.sources.sources:read_log",
 )
 IMAGES = SourceKind(title="rendered", claims=no_name, simulation="coopenv.cars.frames:Rendered")

@@ -72,9 +72,9 @@ class DescribeOptions(options.SourceOptions):
 @options.command
 def describe(given: DescribeOptions) -> None:
     """Print a summary of an environment: vehicles, sensors, observer."""
-    from coopenv.backends.registry import ENVIRONMENT, kind_of
-    from coopenv.backends.sources import simulation_of
     from coopenv.runs.summary import describe_scenario, document, summary
+    from coopenv.sources.registry import ENVIRONMENT, kind_of
+    from coopenv.sources.sources import simulation_of
 
     name = Path(given.environment).stem
     if kind_of(given.environment) is not ENVIRONMENT or any(

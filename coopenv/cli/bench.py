@@ -123,9 +123,9 @@ class ObserverOptions:
 
     def plan(self) -> "Plan":
         """Return the comparison, everything in it checked."""
-        from coopenv.backends.selection import Selection
         from coopenv.bench.observers.comparison import SEEDS, Plan
         from coopenv.bench.observers.sources import find_source
+        from coopenv.sources.selection import Selection
 
         changes = options.parse_overrides(self.overrides)
         chosen = Selection.of(self.start, self.until, self.robots)

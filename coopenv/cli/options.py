@@ -37,8 +37,8 @@ from coopenv.base.installation import BAGS, SCENES, is_scene, list_agents, list_
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from coopenv.backends.base import Backend
-    from coopenv.backends.selection import Selection
+    from coopenv.sources.base import Backend
+    from coopenv.sources.selection import Selection
 
 PLAIN = ("zero", "random")
 """Policies without an agent."""
@@ -84,7 +84,7 @@ def existing(what: str) -> Callable[[Any], Any]:
 
 def known_environment(name: str | None) -> str | None:
     """Return the name of an environment, a file or a recording. Raises CoopenvError: there is none."""
-    from coopenv.backends.registry import ENVIRONMENT, LOG_SUFFIX, kind_of
+    from coopenv.sources.registry import ENVIRONMENT, LOG_SUFFIX, kind_of
 
     if name is not None and name.endswith((*BAGS, LOG_SUFFIX)):
         existing("log" if name.endswith(LOG_SUFFIX) else "bag")(name)
@@ -378,7 +378,7 @@ class SourceOptions:
     @property
     def selection(self) -> Selection:
         """The part of recorded data that is used."""
-        from coopenv.backends.selection import Selection
+        from coopenv.sources.selection import Selection
 
         return Selection.of(self.start, self.until, self.robots)
 
@@ -389,7 +389,7 @@ class SourceOptions:
 
     def open(self) -> Backend:
         """Return the source of ticks."""
-        from coopenv.backends.sources import open_backend
+        from coopenv.sources.sources import open_backend
 
         known: dict[str, Any] = {"topics": self.topics, "selection": self.selection}
         return open_backend(self.environment, None, self.changes, self.data, self.variant, **known)
@@ -445,7 +445,7 @@ def has_display() -> bool:
 
 def load(environment: str, overrides: dict[str, Any]) -> Any:
     """Return the scenario of a simulation."""
-    from coopenv.backends.sources import open_simulation
+    from coopenv.sources.sources import open_simulation
 
     return open_simulation(environment, overrides)
 

@@ -142,7 +142,7 @@ def refuse_for_recordings(environment: str, seed: int, policy: str) -> None:
 
     Of a bag the initial estimates may be drawn.
     """
-    from coopenv.backends.registry import kind_of
+    from coopenv.sources.registry import kind_of
 
     kind = kind_of(environment)
     for option, value in (("--seed", seed if kind.reader else 0), ("--policy", policy)):
@@ -169,8 +169,6 @@ def record(given: RecordOptions) -> None:
 
     The file holds every tick; coopenv replays it, Foxglove and Lichtblick show it with the estimates of an observer.
     """
-    from coopenv.backends.registry import kind_of
-    from coopenv.backends.sources import open_recording
     from coopenv.base.files import check_new
     from coopenv.runs.console import Progress
     from coopenv.runs.recorder import record as recorded
@@ -186,6 +184,8 @@ def record(given: RecordOptions) -> None:
         write_log,
         write_page,
     )
+    from coopenv.sources.registry import kind_of
+    from coopenv.sources.sources import open_recording
 
     out, page, observer, environment = given.out, given.out.with_suffix(".html"), given.observer, given.environment
     check_log(out, observer, given.scene)
@@ -231,8 +231,8 @@ def record(given: RecordOptions) -> None:
 
 def check_log(out: Path, observer: str | None, scene: bool) -> None:
     """Refuse before any work a log that cannot be written. Raises CoopenvError: its path, the observer, or no SDK."""
-    from coopenv.backends.mcap import check_target, log_views
     from coopenv.observers.registry import find, named
+    from coopenv.sources.mcap import check_target, log_views
 
     check_target(out)
     if not scene and observer is not None:
@@ -311,13 +311,13 @@ def export(
 
 
 def _export_layout(log: Path, out: Path) -> None:
-    from coopenv.backends.mcap import log_views
-    from coopenv.backends.mcap_format import codec, reading
     from coopenv.base.errors import DataError
     from coopenv.base.files import replace_text
+    from coopenv.sources.mcap import log_views
+    from coopenv.sources.mcap_format import codec, reading
 
     codec()
-    from coopenv.backends.mcap_container import Container
+    from coopenv.sources.mcap_container import Container
 
     if log.is_dir():
         raise DataError(f"{log}: a folder; expected a log file (.mcap)")

@@ -13,11 +13,11 @@ from coopenv.cli import options
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from coopenv.backends.base import Backend
     from coopenv.policies import Policy
     from coopenv.runs.films import Shot
     from coopenv.runs.live import Reel
     from coopenv.scenario import Scenario
+    from coopenv.sources.base import Backend
     from coopenv.viz.scene import SceneRecord
 
 Agent = Annotated[
@@ -57,8 +57,8 @@ class SceneOptions(options.SourceOptions):
         Raises:
             CoopenvError: there is no such source, or an option is not for it.
         """
-        from coopenv.backends.registry import kind_of
         from coopenv.runs.scenes import open_source
+        from coopenv.sources.registry import kind_of
 
         if self.agent is not None and kind_of(self.environment, self.topics).recorded:
             raise CoopenvError(f"--agent: is for a simulation, {self.environment} is recorded")
@@ -235,7 +235,7 @@ class ViewOptions(SceneOptions):
         """Return the source of ticks, cars included."""
         if self.environment != CARS or self.deployment is None:
             return super().open(more)
-        from coopenv.backends.sources import open_backend
+        from coopenv.sources.sources import open_backend
 
         watching = {} if self.observer is None else {"observer.name": self.observer}
         changes = {**self.changes, **watching, **(more or {})}

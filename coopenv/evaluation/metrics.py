@@ -168,7 +168,8 @@ def scored_errors(
 
 def _mean(start: float, episodes: Episodes) -> Statistic:
     errors, worlds = scored_errors(episodes, start)
-    return Ratio(*(np.bincount(worlds, w, episodes.worlds) for w in (errors, np.ones(len(errors)))))
+    total = np.bincount(worlds, errors, episodes.worlds)
+    return Ratio(total, np.bincount(worlds, minlength=episodes.worlds))
 
 
 def _quantile(name: str, share: float, start: float, episodes: Episodes) -> Statistic:
@@ -191,7 +192,9 @@ def _errors(quantity: str, unit: str, name: str, prefix: str = "") -> dict[str, 
             meaning = f"{word} of the {quantity} error {span}{lost}"
             found[f"{prefix}{short}{when}_{unit}"] = Metric(meaning, unit, partial(_quantile, name, share, start))
         if lost:
-            found[f"mean{when}_{unit}"] = Metric(f"Mean of the {quantity} error {span}{lost}", unit, partial(_mean, start))
+            found[f"mean{when}_{unit}"] = Metric(
+                f"Mean of the {quantity} error {span}{lost}", unit, partial(_mean, start)
+            )
         meaning = f"Root mean square of the {quantity} error {span}"
         found[f"{prefix}rmse{when}_{unit}"] = Metric(meaning, unit, partial(_rmse, name, start))
     return found

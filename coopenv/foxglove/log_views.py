@@ -13,9 +13,9 @@ from coopenv.base.installation import install_command, needing
 from coopenv.viz.style import vehicle_colour
 
 if TYPE_CHECKING:
-    from coopenv.backends.mcap_format import View
     from coopenv.observers import Run
     from coopenv.observers.recording import Recording
+    from coopenv.sources.mcap_format import View
 
 
 def check_installed() -> None:
@@ -41,8 +41,8 @@ def views(recording: Recording, run: Run, *, start: float = 0.0, gain: bool = Fa
         CoopenvError: Foxglove's SDK is not installed.
     """
     check_installed()
-    from coopenv.backends.mcap_format import LogClock
     from coopenv.foxglove.messages import RunView, topics
+    from coopenv.sources.mcap_format import LogClock
 
     return topics(RunView(recording, run, LogClock(recording.dt, start), gain))
 

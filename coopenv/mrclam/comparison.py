@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from coopenv.backends.selection import WHOLE, Selection
-from coopenv.backends.sources import open_recording
 from coopenv.bench.observers.faults import ROBOT_VARIANTS
 from coopenv.bench.observers.sources import RecordSource, already_warned
 from coopenv.mrclam.dataset import IN_SPACE
 from coopenv.observers.recording import Recording
+from coopenv.sources.selection import WHOLE, Selection
+from coopenv.sources.sources import open_recording
 
 
 @dataclass(frozen=True)

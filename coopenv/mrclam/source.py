@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coopenv.backends.registry import SourceKind
+from coopenv.sources.registry import SourceKind
 
 if TYPE_CHECKING:
     from coopenv.observers.recording import Recording
@@ -20,7 +20,7 @@ def is_dataset(name: str, topics: str | Path | None) -> bool:
 
 
 def read(name: str | Path, data: str | Path | None, variant: str | None) -> Recording:
-    """Return a sub-dataset; arguments and errors as for `coopenv.backends.sources.open_recording`."""
+    """Return a sub-dataset; arguments and errors as for `coopenv.sources.sources.open_recording`."""
     from coopenv.mrclam.dataset import IN_SPACE
     from coopenv.mrclam.recording import check_variant, load_dataset, recording_of
 
@@ -31,7 +31,7 @@ def read(name: str | Path, data: str | Path | None, variant: str | None) -> Reco
 
 MRCLAM = SourceKind(
     title="a sub-dataset of MR.CLAM",
-    opener="coopenv.backends.sources:replay_of",
+    opener="coopenv.sources.sources:replay_of",
     claims=is_dataset,
     options=("data", "variant", "selection"),
     recorded=True,

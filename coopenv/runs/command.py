@@ -13,9 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
 
-from coopenv.backends.base import Repeating
-from coopenv.backends.selection import Selection
-from coopenv.backends.sources import open_backend, source_name
 from coopenv.base.columns import WIDTH, Columns, Tabular, one_line, picture_html, terminal_html
 from coopenv.base.errors import CoopenvError, DataError, checked_seed, explained, listed
 from coopenv.base.files import new_folder, replace_text, replacing_folder
@@ -34,6 +31,9 @@ from coopenv.runs.films import VIDEO_FILES, top_view_film, video_path, write_fil
 from coopenv.runs.rollouts import Rollout, estimates, run_metrics, theory_rates, vehicle_metrics
 from coopenv.runs.scenes import Keeper, frame_stride, source_of, write_page
 from coopenv.scenario import Scenario, ScenarioLike, load_scenario
+from coopenv.sources.base import Repeating
+from coopenv.sources.selection import Selection
+from coopenv.sources.sources import open_backend, source_name
 from coopenv.viz import FIGURE_NAMES, FORMATS
 from coopenv.viz.scene import SCENE_FILE
 

@@ -10,7 +10,6 @@ from rich.console import Console
 from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import action_fields
-from coopenv.backends.base import Backend
 from coopenv.base.errors import CoopenvError, listed, suggest
 from coopenv.evaluation.episodes import play
 from coopenv.observers.registry import available_names
@@ -18,6 +17,7 @@ from coopenv.policies import Policy, restart
 from coopenv.runs.console import compile_notice
 from coopenv.runs.scenes import MAX_FPS, frame_stride, source_of
 from coopenv.scenario import Scenario
+from coopenv.sources.base import Backend
 from coopenv.viz.scene import Frame, Origin, SceneRecord
 from coopenv.viz.stage import vehicle_mark
 from coopenv.viz.topview import PictureWindow, TopView

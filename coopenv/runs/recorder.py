@@ -14,8 +14,6 @@ import numpy as np
 
 from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import action_space, observation_layout, observation_space
-from coopenv.backends.base import Backend
-from coopenv.backends.sources import open_backend
 from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import check_new, replace_text, replacing_folder, writing
 from coopenv.base.installation import environment, install_command, needing, version
@@ -26,6 +24,8 @@ from coopenv.observers.mailbox import Interference, interference_of, stacked
 from coopenv.observers.recording import MEASURED, Drawn, Recording, Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
 from coopenv.scenario import Scenario, ScenarioLike
+from coopenv.sources.base import Backend
+from coopenv.sources.sources import open_backend
 
 
 def record(

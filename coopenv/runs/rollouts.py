@@ -11,7 +11,6 @@ import warp as wp
 
 from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
-from coopenv.backends.base import EPISODE_OVER, Backend
 from coopenv.base.errors import CoopenvError, explained
 from coopenv.base.installation import version
 from coopenv.estimation import Outcome, Sight
@@ -21,6 +20,7 @@ from coopenv.estimation.poses import position_covariance, roll_pitch_yaw_deg
 from coopenv.evaluation.episodes import Views, estimated_here, play
 from coopenv.policies import Policy, load_policy
 from coopenv.scenario import Scenario, ScenarioLike, load_scenario
+from coopenv.sources.base import EPISODE_OVER, Backend
 
 RECORDED = (
     *("position", "rotation", "velocity", "angular_velocity", "estimate_rotation", "estimate_position"),

@@ -14,11 +14,6 @@ import numpy as np
 from rich.console import Console
 
 from coopenv.api.engine import Engine
-from coopenv.backends.base import Backend
-from coopenv.backends.mcap import log_views, write_recording
-from coopenv.backends.registry import kind_of
-from coopenv.backends.selection import WHOLE, Selection
-from coopenv.backends.sources import open_backend
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, list_envs
 from coopenv.evaluation.episodes import play
@@ -28,6 +23,11 @@ from coopenv.observers.registry import find, named, states_covariance, with_obse
 from coopenv.policies import Policy, agents_for, find_agent, load_policy
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.scenario import Scenario
+from coopenv.sources.base import Backend
+from coopenv.sources.mcap import log_views, write_recording
+from coopenv.sources.registry import kind_of
+from coopenv.sources.selection import WHOLE, Selection
+from coopenv.sources.sources import open_backend
 from coopenv.viz.scene import SCENE_FILE, Frame, Origin, SceneRecord
 
 BASELINE = "route_follower"

@@ -1,6 +1,6 @@
 """Sections of the programs that may move the vehicles in place of coopenv, see docs/backends.md.
 
-A package offers its own program, a `coopenv.backends.cosimulation.TrafficProgram`, under the entry point group
+A package offers its own program, a `coopenv.sources.cosimulation.TrafficProgram`, under the entry point group
 `coopenv.cosimulators`. In a scenario its name is that of the `backend`, and its section holds its further arguments.
 """
 
@@ -26,7 +26,7 @@ class Cosimulator(Section):
     title: ClassVar[str]
     """Name of the program."""
     program: ClassVar[str]
-    """Its `coopenv.backends.cosimulation.TrafficProgram`, `module:class`, made from the scenario."""
+    """Its `coopenv.sources.cosimulation.TrafficProgram`, `module:class`, made from the scenario."""
     files: ClassVar[tuple[str, ...]] = ()
     """Keys that name files or code of the user's own."""
     unrecorded: ClassVar[Mapping[str, Any]] = {}
@@ -49,7 +49,7 @@ class Highway(Cosimulator):
     """Roads, traffic (IDM and MOBIL) and dynamics of an environment of highway-env, see docs/highway.md."""
 
     title = "highway-env"
-    program = "coopenv.backends.highway:Simulation"
+    program = "coopenv.sources.highway:Simulation"
     reference_midway = True
 
     id: Annotated[str, Field(max_length=64, pattern=r"^[a-z0-9][A-Za-z0-9-]*-v\d+$")]
@@ -106,7 +106,7 @@ class Program(Cosimulator):
     """A program of the user's own."""
 
     title = "the program"
-    program = "coopenv.backends.cosimulation:own_program"
+    program = "coopenv.sources.cosimulation:own_program"
     files = ("code",)
     unrecorded = MappingProxyType({"code": "not_recorded:none"})
 

@@ -18,11 +18,11 @@ from weakref import finalize
 
 import numpy as np
 
-from coopenv.backends.cosimulation import Moment, Poses, TrafficProgram
 from coopenv.base.errors import CoopenvError, ScenarioError, check_one_of, shortened
 from coopenv.base.installation import install_command
 from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario
+from coopenv.sources.cosimulation import Moment, Poses, TrafficProgram
 from coopenv.sumo import process
 from coopenv.sumo.files import departures, route_edges
 

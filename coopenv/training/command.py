@@ -22,7 +22,6 @@ from safetensors.numpy import save_file
 from stable_baselines3.common.logger import configure
 
 from coopenv.api.engine import Engine
-from coopenv.backends.sources import open_simulation
 from coopenv.base import interrupts
 from coopenv.base.errors import CoopenvError, OutputError, evaluation_seed
 from coopenv.base.files import check_file, new_folder, replacing_file, replacing_folder, writing
@@ -30,6 +29,7 @@ from coopenv.evaluation import Result, drive, held_out_seeds, ranking_key, score
 from coopenv.policies import Policy, load_agent
 from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE
 from coopenv.scenario import Scenario
+from coopenv.sources.sources import open_simulation
 from coopenv.training.export import EXPORTED, check_onnx, export
 from coopenv.training.ranking import Figures, Ranking, figures_of
 from coopenv.training.sets import SetTrainer

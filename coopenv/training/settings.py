@@ -15,7 +15,6 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import Field, model_validator
 
 from coopenv.api.terms.layout import observation_layout, settings_of_meaning
-from coopenv.backends.sources import open_simulation
 from coopenv.base.errors import CoopenvError, OutputError, check_one_of, listed
 from coopenv.base.files import writing
 from coopenv.base.installation import (
@@ -34,6 +33,7 @@ from coopenv.scenario.cosimulators import FILES
 from coopenv.scenario.files import merged
 from coopenv.scenario.own_terms import SECTIONS, located
 from coopenv.scenario.scenes import scene_text
+from coopenv.sources.sources import open_simulation
 
 SETTINGS_FILE = "train.toml"
 Count = Annotated[int, Field(gt=0, le=2**31)]

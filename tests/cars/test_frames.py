@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 import coopenv
 from coopenv import CoopenvError
-from coopenv.backends.base import Command
-from coopenv.backends.sources import simulation_of
 from coopenv.cars.frames import FrameRenderer, PlacedTag, facing
 from coopenv.cars.vision import Calibration, dictionary_of, opencv
 from coopenv.observers.recording import Sensed
 from coopenv.scenario import Scenario, parse_scenario
+from coopenv.sources.base import Command
+from coopenv.sources.sources import simulation_of
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "rendered_frames.toml"
 CAMERA = {

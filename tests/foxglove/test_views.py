@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.mcap import read_recording, write_recording
 from coopenv.cli.app import main
 from coopenv.estimation.poses import Coordinates, covariance_in_map
 from coopenv.observers import Run, run
 from coopenv.observers.recording import Recording
 from coopenv.scenario.sensing import Camera
+from coopenv.sources.mcap import read_recording, write_recording
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import differences, simulated
 
@@ -157,7 +157,7 @@ def test_lines_of_sight_end_where_the_measured_bearings_point(crossing: Any) -> 
 
 
 def test_estimates_have_the_covariance_in_the_maps_axes(crossing: Any) -> None:
-    from coopenv.backends.mcap_format import codec
+    from coopenv.sources.mcap_format import codec
 
     made, result, log, _ = crossing
     P = covariance_in_map(result.coordinates, result.rotation, result.position, result.covariance)
@@ -247,8 +247,8 @@ def test_what_is_shown_costs_little(crossing: Any) -> None:
 
 
 def test_gain_matrices_are_no_covariances(tmp_path: Path) -> None:
-    from coopenv.backends.mcap_format import codec
     from coopenv.foxglove.log_views import views
+    from coopenv.sources.mcap_format import codec
 
     made, path = simulated("crossing_path", horizon=22.0), tmp_path / "gain.mcap"
     shown = views(made, run("riccati", made), gain=True)

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
-from coopenv.backends.mcap import read_recording, write_recording
-from coopenv.backends.worlds import Replay
 from coopenv.mrclam.recording import load_dataset, recording_of
 from coopenv.observers.recording import Recording
+from coopenv.sources.mcap import read_recording, write_recording
+from coopenv.sources.worlds import Replay
 from tests.fuzz.harness import go_through, taken
 from tests.fuzz.scenarios import at, mutate, places
 from tests.helpers import mrclam_files

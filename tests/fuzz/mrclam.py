@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
-from coopenv.backends.worlds import Replay
 from coopenv.mrclam.recording import VARIANTS, load_dataset, recording_of
 from coopenv.observers import Recording
+from coopenv.sources.worlds import Replay
 from tests.fuzz.harness import go_through, taken
 from tests.helpers import mrclam_files
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.worlds import Simulated
 from coopenv.base.errors import ScenarioWarning
 from coopenv.scenario import Scenario, parse_scenario
+from coopenv.sources.worlds import Simulated
 from coopenv.world.world import World
 from tests.oracles import continuous
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.base import Capabilities, Command, Episode, TickGenerator
 from coopenv.observers.recording import Sensed, Truth
 from coopenv.scenario import Scenario
+from coopenv.sources.base import Capabilities, Command, Episode, TickGenerator
 from tests.helpers.builders import landmark, scenario, vehicle
 
 CAMERA, DECISION = 30.0, 10.0

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from coopenv.backends.mcap_format import ATTACHMENT
+from coopenv.sources.mcap_format import ATTACHMENT
 
 
 class Sent(NamedTuple):

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from coopenv.backends.worlds import Replay
 from coopenv.observers import Message, Recording, Run, run
 from coopenv.observers.contract import Factory
 from coopenv.observers.group import Tamper
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
+from coopenv.sources.worlds import Replay
 from coopenv.world.world import World
 
 

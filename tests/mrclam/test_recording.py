@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.sources import open_recording
 from coopenv.base.errors import DataError
 from coopenv.mrclam.dataset import MotionCapture
 from coopenv.mrclam.planar import PlanarEkf, PlanarRobust
 from coopenv.mrclam.recording import DRIFT_STD, MESSAGE_PERIOD_TICKS, START_STD, TICK_S, load_dataset, recording_of
 from coopenv.observers.runner import run
+from coopenv.sources.sources import open_recording
 from tests.helpers.env_suite import rest_slow
 from tests.helpers.mrclam_files import LANDMARKS, command, pose, real_folder, write
 

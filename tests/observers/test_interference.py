@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose
 
-from coopenv.backends.worlds import Replay
 from coopenv.base.errors import CoopenvError, world_keys
 from coopenv.observers import Message, Recording, run
 from coopenv.observers.centralised import Centralised
@@ -21,6 +20,7 @@ from coopenv.observers.contract import Tick, check_received
 from coopenv.observers.pose_filters import MekfCovariance
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
+from coopenv.sources.worlds import Replay
 from coopenv.world.world import World
 from tests.helpers.builders import estimated_position, start
 from tests.helpers.builders import run as over_ticks

@@ -17,13 +17,13 @@ from numpy.testing import assert_allclose
 
 import coopenv
 from coopenv.api.engine import Engine
-from coopenv.backends.worlds import Replay
 from coopenv.base.errors import CoopenvError
 from coopenv.observers import Estimate, Message, Received, Recording, Tick, kernel_observer, register, registry
 from coopenv.observers.kernel_observer import MOST_UNITS, UNITS_PER_TICK
 from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.observers.registry import find, find_embedded, named, portable
 from coopenv.scenario.schema import neighbour_sets
+from coopenv.sources.worlds import Replay
 from coopenv.world import warp_internals
 from coopenv.world.embedded import Embedded, send_nothing, start_nothing
 from coopenv.world.state import array

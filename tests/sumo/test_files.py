@@ -10,8 +10,8 @@ import pytest
 
 import coopenv
 from coopenv import ScenarioError
-from coopenv.backends.cosimulation import Moment
 from coopenv.scenario import Scenario
+from coopenv.sources.cosimulation import Moment
 from coopenv.sumo import program as sumo
 from coopenv.sumo.files import departures
 from coopenv.sumo.process import SumoTraffic

@@ -17,7 +17,7 @@ import warp as wp
 
 import coopenv
 from coopenv.api.vector_env import INFO_FIELDS
-from coopenv.backends.worlds import Simulated
+from coopenv.sources.worlds import Simulated
 from coopenv.world import launch, state
 from coopenv.world import world as batches
 from coopenv.world.launch import start_warp

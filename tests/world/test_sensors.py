@@ -15,14 +15,14 @@ import coopenv
 from coopenv.api.engine import Engine
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.terms.layout import observation_layout
-from coopenv.backends.mcap import read_recording, write_recording
-from coopenv.backends.worlds import Replay
 from coopenv.base.errors import ActionError, ScenarioError
 from coopenv.estimation import Sight
 from coopenv.observers.runner import observer_init_of
 from coopenv.policies.base import decide, random_policy, zero_policy
 from coopenv.runs import record
 from coopenv.scenario import Scenario, load_scenario, parse_scenario
+from coopenv.sources.mcap import read_recording, write_recording
+from coopenv.sources.worlds import Replay
 from tests.helpers.builders import command, constant, run, same_bits, scenario, simulate, start, vehicle
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.warp_calls import DTYPES

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
-from coopenv.backends.selection import Selection
 from coopenv.base.columns import Columns, Tabular, one_line, picture_html, terminal_html, written
 from coopenv.base.errors import CoopenvError, DataWarning, check_one_of, checked_seed, explained
 from coopenv.base.installation import names_of
@@ -26,6 +25,7 @@ from coopenv.observers.contract import Factory
 from coopenv.observers.registry import available_names, find, list_observers, named, obstacle, portable
 from coopenv.runs.console import Progress
 from coopenv.scenario import ScenarioLike
+from coopenv.sources.selection import Selection
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -15,10 +15,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from coopenv.backends.base import Backend
-from coopenv.backends.registry import ENVIRONMENT, kind_of
-from coopenv.backends.selection import WHOLE, Selection
-from coopenv.backends.sources import OBJECT, is_recording, open_backend, open_recording
 from coopenv.base.errors import CoopenvError, DataWarning, suggest
 from coopenv.base.plugins import call
 from coopenv.bench.observers.changes import NO_FOLLOWERS, leaders_of
@@ -37,6 +33,10 @@ from coopenv.policies import load_policy
 from coopenv.policies.base import played_back
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, ScenarioLike, load_scenario, scenario_name
+from coopenv.sources.base import Backend
+from coopenv.sources.registry import ENVIRONMENT, kind_of
+from coopenv.sources.selection import WHOLE, Selection
+from coopenv.sources.sources import OBJECT, is_recording, open_backend, open_recording
 
 already_warned = partial(warnings.catch_warnings, action="ignore", category=DataWarning)
 """Silences the warnings on recorded data that `Source.check` has given."""
@@ -190,7 +190,7 @@ class GivenRecord(RecordSource):
 
 def _with_faults(recording: Recording, seed: int) -> Recording:
     """Return a recording with its scenario's faults, drawn again: files have no messages."""
-    from coopenv.backends.worlds import Replay, has_faults
+    from coopenv.sources.worlds import Replay, has_faults
 
     if recording.interference is not None or not has_faults(recording):
         return recording

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.base import EPISODE_OVER, Capabilities, Command, Health, VehicleBroadcast
 from coopenv.base.errors import CoopenvError, DataWarning, ScenarioError, listed
 from coopenv.base.installation import scenario_path
 from coopenv.cars.backend.assembler import BROADCAST, Assembler, Intake
@@ -36,6 +35,7 @@ from coopenv.estimation.poses import left_covariance
 from coopenv.observers.recording import Sensed
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.files import OVERRIDES
+from coopenv.sources.base import EPISODE_OVER, Capabilities, Command, Health, VehicleBroadcast
 
 EXPECTED = ("reset", "closed", EPISODE_OVER)
 """Reasons to stop that are no emergency."""

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.base import VehicleBroadcast, check_options
 from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
 from coopenv.cars.backend.buffers import PlaceTrack
 from coopenv.cars.codec import header, make, pose
@@ -20,6 +19,7 @@ from coopenv.observers.robust.messages import from_six
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets
 from coopenv.scenario.sensing import rotation_of
+from coopenv.sources.base import VehicleBroadcast, check_options
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from coopenv.backends.base import Capabilities, Episode, TickGenerator
-from coopenv.backends.mcap_format import CUT_OFF, RosLog, codec, reading
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, OutputError
 from coopenv.base.files import writing
 from coopenv.base.installation import install_command, version
@@ -32,6 +30,8 @@ from coopenv.cars.transport import Arrival, Transport
 from coopenv.scenario import parse_scenario
 from coopenv.scenario.files import override
 from coopenv.scenario.own_terms import without_own_terms
+from coopenv.sources.base import Capabilities, Episode, TickGenerator
+from coopenv.sources.mcap_format import CUT_OFF, RosLog, codec, reading
 
 FORMAT = "coopenv drive 1"
 ATTACHMENT = "drive.json"
@@ -173,7 +173,7 @@ class Drive(TickGenerator):
             CoopenvError: an override is not valid, or the extra is missing.
         """
         codec()  # its error names the missing extra
-        from coopenv.backends.mcap_container import Container
+        from coopenv.sources.mcap_container import Container
 
         self._where = str(path)
         with reading(self._where):

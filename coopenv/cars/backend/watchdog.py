@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 
-from coopenv.backends.base import VehicleBroadcast
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.station import BYPASSED, OLD, OPEN, Gates, Station
 from coopenv.cars.deployment import Safety
@@ -20,6 +19,7 @@ from coopenv.cars.profile import Role, inside, presence_of
 from coopenv.cars.readings import CarPose, Sample
 from coopenv.estimation.poses import Array, skew
 from coopenv.observers.contract import Message
+from coopenv.sources.base import VehicleBroadcast
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.base import Capabilities, Episode, TickGenerator
-from coopenv.backends.selection import WHOLE, Selection
-from coopenv.backends.worlds import without_robots
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning, check_one_of, listed
 from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.binding import OPTIONS, bind, marker_places, reset_options
@@ -27,6 +24,9 @@ from coopenv.cars.profile import Role
 from coopenv.cars.readings import CarPose, Sample
 from coopenv.estimation.poses import MISFIT_DEG
 from coopenv.scenario import Scenario, load_scenario
+from coopenv.sources.base import Capabilities, Episode, TickGenerator
+from coopenv.sources.selection import WHOLE, Selection
+from coopenv.sources.worlds import without_robots
 
 AHEAD = 100_000_000
 """ns by which motion capture is read ahead of a tick, so that the truth lies between two of its poses."""

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.backends.mcap_format import MAGIC, REPAIR, metadata_names
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, error_text, listed, printable
 from coopenv.base.installation import install_command
+from coopenv.sources.mcap_format import MAGIC, REPAIR, metadata_names
 
 if TYPE_CHECKING:
     from coopenv.cars.bags.definitions import BagChannel
@@ -111,7 +111,7 @@ class BagFile:
         """Return a copy of a packed file that is unpacked, until the bag is closed. Raises TooLargeError."""
         import zstandard
 
-        from coopenv.backends.mcap_container import Allowance
+        from coopenv.sources.mcap_container import Allowance
 
         place = Path(self._stack.enter_context(tempfile.TemporaryDirectory()), file.name.removesuffix(PACKED))
         allowance = Allowance(file.stat().st_size)
@@ -147,7 +147,7 @@ class BagFile:
         return {name: (stamps, received) for name, (stamps, received) in tables.items()}
 
     def _raw(self, topics: Collection[str]) -> Iterator[tuple[BagChannel, int, bytes]]:
-        from coopenv.backends.mcap_container import TooLargeError
+        from coopenv.sources.mcap_container import TooLargeError
 
         wanted = {channel for channel in self.channels if channel.topic in topics}
         parts = [part.messages(wanted) for part in self._parts] if wanted else []
@@ -179,7 +179,7 @@ class BagFile:
             warnings.warn(f"{self.path}: {text}", DataWarning, stacklevel=3)
 
     def _unreadable(self, error: Exception) -> DataError:
-        from coopenv.backends.mcap_container import TooLargeError
+        from coopenv.sources.mcap_container import TooLargeError
 
         if isinstance(error, TooLargeError):
             return DataError(f"{self.path}: {error}")

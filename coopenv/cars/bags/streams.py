@@ -14,11 +14,11 @@ from typing import Any, BinaryIO
 
 import apsw
 
-from coopenv.backends import mcap_container as container
-from coopenv.backends.mcap_container import Allowance, TooLargeError, messages_of, records_of
-from coopenv.backends.mcap_format import MAGIC, is_cut_off
 from coopenv.base.errors import regular
 from coopenv.cars.bags.definitions import ROS1, BagChannel
+from coopenv.sources import mcap_container as container
+from coopenv.sources.mcap_container import Allowance, TooLargeError, messages_of, records_of
+from coopenv.sources.mcap_format import MAGIC, is_cut_off
 
 ENDS_EARLY = "its end is missing"
 ZSTD = b"\x28\xb5\x2f\xfd"

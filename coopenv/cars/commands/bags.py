@@ -129,8 +129,6 @@ def calibrate(
     as_json: options.AsJson = False,
 ) -> None:
     """Estimate cameras, odometry, clocks and markers of cars from one drive, and print which constants are wrong."""
-    from coopenv.backends.registry import kind_of
-    from coopenv.backends.sources import open_recording
     from coopenv.base.files import check_file, new_folder, replace_text
     from coopenv.cars.bags.bag import open_bags
     from coopenv.cars.calibration import calibrate as calibrated
@@ -138,6 +136,8 @@ def calibrate(
     from coopenv.cars.calibration_drives import drive_of_bag, drive_of_recording
     from coopenv.cars.calibration_figure import residual_figure
     from coopenv.runs.console import Progress
+    from coopenv.sources.registry import kind_of
+    from coopenv.sources.sources import open_recording
     from coopenv.viz.style import save
 
     with new_folder(out):

@@ -297,7 +297,7 @@ def test_figures_have_the_width_and_font_of_a_column(comparison: coopenv.Compari
 def test_a_log_file_gives_the_rows_of_what_it_recorded(tmp_path: Path) -> None:
     mcap = pytest.importorskip("mcap", reason="needs the extra log")
     assert mcap is not None
-    from coopenv.backends.mcap import write_recording
+    from coopenv.sources.mcap import write_recording
 
     write_recording(record(coopenv.load_scenario("overtaking", {"horizon": 1.0}), 0), tmp_path / "drive.mcap")
     options: dict[str, Any] = {"variants": ["nominal", "v2x_delay"], "steady_from": 0.5}

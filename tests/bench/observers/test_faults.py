@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 import coopenv
-from coopenv.backends.mcap import write_recording
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers.changes import DIRECTION, usual_sender
 from coopenv.bench.observers.command import figure_files
@@ -28,6 +27,7 @@ from coopenv.observers import Message, Recording
 from coopenv.observers.mailbox import Interference, altered
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
+from coopenv.sources.mcap import write_recording
 from tests.helpers.commands import refused
 
 ENV = "busy_intersection_tracking"

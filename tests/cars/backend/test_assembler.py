@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.backends.base import VehicleBroadcast
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.assembler import Assembler, Intake, TopicClock
 from coopenv.cars.backend.binding import Binding, bind, estimate_message, report_message
@@ -23,6 +22,7 @@ from coopenv.estimation.poses import exp_so3
 from coopenv.observers.contract import Message
 from coopenv.observers.recording import Sensed
 from coopenv.scenario import Scenario
+from coopenv.sources.base import VehicleBroadcast
 from tests.helpers.builders import landmark, scenario, vehicle
 from tests.helpers.paths import Path
 

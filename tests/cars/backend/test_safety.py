@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.backends.base import VehicleBroadcast
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.buffers import StatusBoard
@@ -26,6 +25,7 @@ from coopenv.cars.readings import CarPose, Sample, Twist
 from coopenv.cars.transport import Arrival
 from coopenv.cars.vision import Calibration
 from coopenv.estimation.poses import exp_so3
+from coopenv.sources.base import VehicleBroadcast
 from tests.cars.backend.test_assembler import binding
 from tests.helpers.processes import wait_until
 

@@ -23,9 +23,6 @@ from rich.console import Console
 from rosbags.highlevel import AnyReader
 
 import coopenv
-from coopenv.backends.base import Command
-from coopenv.backends.mcap import read_recording
-from coopenv.backends.registry import kind_of
 from coopenv.base.errors import DataError, DataWarning, OutputError
 from coopenv.cars.backend.drive import PRESENCE, Drive, DriveRecorder, RecordedTransport
 from coopenv.cars.codec import MOST_BYTES, TICK, encode, header, make
@@ -35,6 +32,9 @@ from coopenv.cars.profile import STOPPED_TOPIC, SVEA, TICK_TOPIC, Role, presence
 from coopenv.cars.source import DRIVE
 from coopenv.runs.command import execute, report
 from coopenv.runs.rollouts import Rollout
+from coopenv.sources.base import Command
+from coopenv.sources.mcap import read_recording
+from coopenv.sources.registry import kind_of
 from tests.helpers.cars import cars, fakes, write_fleet
 from tests.helpers.processes import DEADLOCK, start
 

@@ -18,9 +18,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 from coopenv import CoopenvError, DataError
-from coopenv.backends import mcap_container as container
-from coopenv.backends.mcap_format import metadata_names
-from coopenv.backends.registry import ENVIRONMENT, LOG, kind_of
 from coopenv.base.errors import DataWarning
 from coopenv.cars import codec
 from coopenv.cars.bags import files, streams
@@ -33,6 +30,9 @@ from coopenv.cars.source import BAG
 from coopenv.cli.app import main
 from coopenv.estimation.poses import exp_so3
 from coopenv.scenario import load_scenario
+from coopenv.sources import mcap_container as container
+from coopenv.sources.mcap_format import metadata_names
+from coopenv.sources.registry import ENVIRONMENT, LOG, kind_of
 from tests.helpers import bags
 from tests.helpers.bags import MAP
 

@@ -15,9 +15,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import coopenv
 from coopenv import CoopenvError, DataError
-from coopenv.backends.mcap import read_recording
-from coopenv.backends.registry import LOG, kind_of
-from coopenv.backends.sources import open_backend, open_recording
 from coopenv.base.errors import DataWarning
 from coopenv.bench.observers import sources
 from coopenv.cars import codec
@@ -31,6 +28,9 @@ from coopenv.observers import Recording, run
 from coopenv.observers.recording import Sensed
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
+from coopenv.sources.mcap import read_recording
+from coopenv.sources.registry import LOG, kind_of
+from coopenv.sources.sources import open_backend, open_recording
 from tests.helpers import bags
 
 SAMPLES = Path(__file__).resolve().parents[3] / "examples" / "bags"

@@ -9,12 +9,12 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.base import Command
-from coopenv.backends.worlds import Simulated
 from coopenv.cars.codec import stamp_of
 from coopenv.cars.deployment import Sensors
 from coopenv.cars.profile import Role
 from coopenv.scenario import load_scenario
+from coopenv.sources.base import Command
+from coopenv.sources.worlds import Simulated
 from tests.helpers.fakes import CAMERA, CROSSING, EXACT, MARKER, MARKERS, OVERTAKING, Stage, turned
 
 SEQUENCE = [(0.4, 0.3, 1.0), (0.25, -0.4, 1.5), (0.05, 0.2, 0.5), (0.5, 0.0, 1.0), (0.0, 0.5, 1.0)]

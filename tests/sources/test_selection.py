@@ -14,15 +14,15 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import coopenv
 from coopenv import CoopenvError, DataError
-from coopenv.backends.mcap import write_recording
-from coopenv.backends.selection import Selection
-from coopenv.backends.sources import is_recording, open_recording
 from coopenv.base.errors import DataWarning
 from coopenv.bench.observers import compare
 from coopenv.cars.bags.topic_map import load_map
 from coopenv.cli.app import main
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Truth, check_recording
+from coopenv.sources.mcap import write_recording
+from coopenv.sources.selection import Selection
+from coopenv.sources.sources import is_recording, open_recording
 from coopenv.sumo import files as sumo_files
 from tests.helpers import mrclam_files
 from tests.helpers.recordings import simulated

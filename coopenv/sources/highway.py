@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.cosimulation import Moment, Poses, TrafficProgram
 from coopenv.base.errors import CoopenvError, ScenarioError, error_text, listed, shown, suggest
 from coopenv.base.installation import install_command, needing
 from coopenv.estimation.poses import Array
@@ -14,6 +13,7 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Road
 from coopenv.scenario.cosimulators import Highway
 from coopenv.scenario.learning import Dynamics
+from coopenv.sources.cosimulation import Moment, Poses, TrafficProgram
 from coopenv.world.dynamics import ACCELERATION, SPEED, STEERING
 
 BEND = 2.0  # m, length of a strip of a lane that bends

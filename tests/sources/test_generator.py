@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 import coopenv
 from coopenv import CoopenvError
 from coopenv.api.engine import Engine
-from coopenv.backends.base import VehicleBroadcast
 from coopenv.observers import Message, Received, register, registry, run
 from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.observers.recording import Sensed, check_recording
 from coopenv.policies import load_policy
 from coopenv.runs import record
+from coopenv.sources.base import VehicleBroadcast
 from coopenv.world.launch import kernel
 from tests.helpers.env_suite import CHECKS, Env, Make, official_tests, rollout
 from tests.helpers.fleet import CAMERA, MAX_SPEED, MAX_STEERING, Fleet

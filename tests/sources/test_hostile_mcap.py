@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from coopenv import DataError
-from coopenv.backends import mcap_container as container
-from coopenv.backends.mcap import read_recording, write_recording
-from coopenv.backends.worlds import Replay
+from coopenv.sources import mcap_container as container
+from coopenv.sources.mcap import read_recording, write_recording
+from coopenv.sources.worlds import Replay
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.mcap_edits import Sent, edit
 from tests.helpers.recordings import simulated

@@ -70,7 +70,7 @@ class Selection:
         """
         if not self.given:
             return recording
-        from coopenv.backends.worlds import of_robots, stretch
+        from coopenv.sources.worlds import of_robots, stretch
 
         names = [setup.name for setup in recording.setups]
         for name in self.robots or ():

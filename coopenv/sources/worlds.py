@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.backends.base import Capabilities, Episode, SensingWorld, TickGenerator
-from coopenv.backends.feed import RECORDED, Feed
 from coopenv.base.errors import CoopenvError, DataError, ScenarioWarning
 from coopenv.estimation import Sight
 from coopenv.observers.arrays import ARRAYS
@@ -22,6 +20,8 @@ from coopenv.observers.runner import start_covariances
 from coopenv.scenario import Scenario, parse_scenario
 from coopenv.scenario.files import override
 from coopenv.scenario.schema import neighbour_sets, processing_order
+from coopenv.sources.base import Capabilities, Episode, SensingWorld, TickGenerator
+from coopenv.sources.feed import RECORDED, Feed
 from coopenv.world.embedded import HOST
 
 

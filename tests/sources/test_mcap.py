@@ -15,11 +15,11 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from coopenv import DataError
-from coopenv.backends.mcap import read_recording, write_recording
 from coopenv.cli.app import main
 from coopenv.mrclam.recording import load_dataset, recording_of
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Truth
+from coopenv.sources.mcap import read_recording, write_recording
 from tests.helpers import mrclam_files
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import differences, simulated

@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.mcap_format import (
+from coopenv.base.errors import DataError, OutputError, check_memory, shown
+from coopenv.base.files import check_file, replacing_file
+from coopenv.base.installation import version
+from coopenv.base.plugins import loaded, offered
+from coopenv.base.sections import validated
+from coopenv.observers.arrays import ARRAYS, sizes_of
+from coopenv.observers.contract import Setup
+from coopenv.observers.recording import Recording, Truth, check_recording
+from coopenv.sources.mcap_format import (
     ATTACHMENT,
     CONTENTS,
     FORMAT,
@@ -30,17 +38,9 @@ from coopenv.backends.mcap_format import (
     reading,
     topic,
 )
-from coopenv.base.errors import DataError, OutputError, check_memory, shown
-from coopenv.base.files import check_file, replacing_file
-from coopenv.base.installation import version
-from coopenv.base.plugins import loaded, offered
-from coopenv.base.sections import validated
-from coopenv.observers.arrays import ARRAYS, sizes_of
-from coopenv.observers.contract import Setup
-from coopenv.observers.recording import Recording, Truth, check_recording
 
 if TYPE_CHECKING:
-    from coopenv.backends.mcap_container import Container
+    from coopenv.sources.mcap_container import Container
 
 
 class TickArrays:
@@ -123,7 +123,7 @@ def read_recording(path: str | Path) -> Recording:
             itself.
     """
     codec()
-    from coopenv.backends.mcap_container import Container
+    from coopenv.sources.mcap_container import Container
 
     where = str(path)
     with reading(where):

@@ -10,18 +10,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
-from coopenv.backends.registry import ENVIRONMENT, LOG, kind_of, kinds, live_kind
-from coopenv.backends.selection import WHOLE, Selection
 from coopenv.base.errors import CoopenvError, DataError, check_one_of
 from coopenv.base.plugins import call
+from coopenv.sources.registry import ENVIRONMENT, LOG, kind_of, kinds, live_kind
+from coopenv.sources.selection import WHOLE, Selection
 
 if TYPE_CHECKING:
     from typing_extensions import TypeIs
 
-    from coopenv.backends.base import Backend
-    from coopenv.backends.worlds import Simulated
     from coopenv.observers.recording import Recording
     from coopenv.scenario import Scenario, ScenarioLike
+    from coopenv.sources.base import Backend
+    from coopenv.sources.worlds import Simulated
 
 
 OBJECT = "recording"
@@ -73,7 +73,7 @@ def read_log(name: str | Path, data: str | Path | None, variant: str | None) -> 
     """Return the recording in an MCAP file; `data` is not read. Raises CoopenvError: it is none, or has no variants."""
     if variant is not None:
         raise DataError(f"{name}: a file has no variants, got variant '{variant}'")
-    from coopenv.backends.mcap import read_recording
+    from coopenv.sources.mcap import read_recording
 
     return read_recording(name)
 
@@ -86,7 +86,7 @@ def replay_of(
     selection: Selection = WHOLE,
 ) -> Backend:
     """Return the replay of a recording by its name; arguments and errors as for `open_recording`."""
-    from coopenv.backends.worlds import Replay
+    from coopenv.sources.worlds import Replay
 
     return Replay(open_recording(name, data, variant, selection), Path(name).name, overrides)
 
@@ -113,13 +113,13 @@ def simulation_of(scenario: Scenario) -> Simulated:
         CoopenvError: an extra is missing, or the section of the backend is not valid.
     """
     if scenario.cosimulator is not None:
-        from coopenv.backends.cosimulation import Cosimulated
+        from coopenv.sources.cosimulation import Cosimulated
 
         return Cosimulated(scenario)
     if scenario.sensing == "images":
         made: Simulated = call(kinds()[scenario.sensing].simulation, scenario)
         return made
-    from coopenv.backends.worlds import Simulated
+    from coopenv.sources.worlds import Simulated
 
     return Simulated(scenario)
 
@@ -160,7 +160,7 @@ def open_backend(
         for name in given:
             raise CoopenvError(f"{name} is for files, a Recording was given")
         check_one_of("backend of a Recording", backend or "replay", ("replay",))
-        from coopenv.backends.worlds import Replay
+        from coopenv.sources.worlds import Replay
 
         return Replay(selection.applied(name_or_path, OBJECT), OBJECT, overrides)
     kind = kind_of(name_or_path, topics)
@@ -189,6 +189,6 @@ def open_environment(name_or_path: ScenarioLike, overrides: Mapping[str, Any], b
 def _is_backend(given: str | Backend | None) -> TypeGuard[Backend]:
     if given is None or isinstance(given, str):  # so that names are looked up before the simulation is loaded
         return False
-    from coopenv.backends.base import Backend
+    from coopenv.sources.base import Backend
 
     return isinstance(given, Backend)

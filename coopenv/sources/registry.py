@@ -17,10 +17,10 @@ from coopenv.base.installation import is_scene, list_envs
 from coopenv.base.plugins import call, loaded, offered
 
 if TYPE_CHECKING:
-    from coopenv.backends.base import Backend
-    from coopenv.backends.selection import Selection
     from coopenv.observers.recording import Recording
     from coopenv.scenario import ScenarioLike
+    from coopenv.sources.base import Backend
+    from coopenv.sources.selection import Selection
 
 GROUP = "coopenv.sources"
 
@@ -77,14 +77,14 @@ class SourceKind:
 
 LOG = SourceKind(
     title="an MCAP file",
-    opener="coopenv.backends.sources:replay_of",
+    opener="coopenv.sources.sources:replay_of",
     claims=lambda name, topics: name.endswith(LOG_SUFFIX),
     options=("data", "variant", "selection"),
     recorded=True,
-    reader="coopenv.backends.sources:read_log",
+    reader="coopenv.sources.sources:read_log",
     example=f"FILE{LOG_SUFFIX}",
 )
-ENVIRONMENT = SourceKind(title="simulated", opener="coopenv.backends.sources:open_environment", options=("backend",))
+ENVIRONMENT = SourceKind(title="simulated", opener="coopenv.sources.sources:open_environment", options=("backend",))
 """Whatever no other kind claims: an environment by name, file, scene or dict."""
 
 

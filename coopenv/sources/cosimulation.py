@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.feed import COSIMULATED, cosimulation_struct
-from coopenv.backends.worlds import Simulated, SimulatedWorld
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.installation import blamed, load_reference
 from coopenv.estimation.poses import Array, about_z
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Road
+from coopenv.sources.feed import COSIMULATED, cosimulation_struct
+from coopenv.sources.worlds import Simulated, SimulatedWorld
 from coopenv.world.dynamics import SPEED, STEERING
 from coopenv.world.launch import PerWorld
 from coopenv.world.route import UNDER_WAY
@@ -105,7 +105,7 @@ def own_program(scenario: Scenario) -> TrafficProgram:
     with blamed(f"program.code: {code}"):
         made = load_reference(code)(scenario, **options)
     if not isinstance(made, TrafficProgram):
-        raise CoopenvError(f"program.code: {code} makes no coopenv.backends.cosimulation.TrafficProgram")
+        raise CoopenvError(f"program.code: {code} makes no coopenv.sources.cosimulation.TrafficProgram")
     return made
 
 

@@ -21,14 +21,14 @@ import coopenv
 from coopenv import CoopenvError
 from coopenv.api.engine import Engine
 from coopenv.api.parallel_env import CooperativeLocalisationEnv as Env
-from coopenv.backends.base import Backend, Command
-from coopenv.backends.mcap import read_recording, write_recording
-from coopenv.backends.tick_world import TickWorld, open_world
-from coopenv.backends.worlds import Replay, Simulated
 from coopenv.mrclam.recording import load_dataset, recording_of
 from coopenv.observers import Recording, run
 from coopenv.runs import record
 from coopenv.scenario import Scenario
+from coopenv.sources.base import Backend, Command
+from coopenv.sources.mcap import read_recording, write_recording
+from coopenv.sources.tick_world import TickWorld, open_world
+from coopenv.sources.worlds import Replay, Simulated
 from tests.helpers import builders, mrclam_files
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import simulated

@@ -15,8 +15,8 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 
-from coopenv.backends.mcap_format import CUT_OFF, MAGIC, MENDED, is_cut_off
 from coopenv.base.errors import DataError, check_memory, regular, shown
+from coopenv.sources.mcap_format import CUT_OFF, MAGIC, MENDED, is_cut_off
 
 AT_ONCE = 32 * 2**20
 """Bytes that a chunk, or a message, may unpack to: a raw 4K image fits. Writers of logs make chunks of about 1 MiB."""

@@ -8,15 +8,15 @@ from typing import Any
 import pytest
 
 import coopenv
-from coopenv.backends.registry import ENVIRONMENT, kind_of
-from coopenv.backends.sources import open_backend, open_simulation
 from coopenv.base.errors import CoopenvError
 from coopenv.cli.app import main
+from coopenv.sources.registry import ENVIRONMENT, kind_of
+from coopenv.sources.sources import open_backend, open_simulation
 from tests.helpers.plugins import install
 
 TWIN = """
-from coopenv.backends.registry import SourceKind
-from coopenv.backends.worlds import Simulated
+from coopenv.sources.registry import SourceKind
+from coopenv.sources.worlds import Simulated
 from coopenv.scenario import load_scenario
 
 TWIN = SourceKind(title="a twin", opener="twin:open_twin", options=("variant",))

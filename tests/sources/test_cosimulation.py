@@ -15,7 +15,7 @@ from tests.helpers.plugins import install
 
 CODE = '''
 import numpy as np
-from coopenv.backends.cosimulation import Poses, TrafficProgram
+from coopenv.sources.cosimulation import Poses, TrafficProgram
 
 
 class Circle(TrafficProgram):
@@ -103,7 +103,7 @@ def test_programs_that_cannot_be_are_one_line(own: dict[str, Any]) -> None:
     code = own["program"]["code"]
     for change, why in (
         ({"code": code.replace("Circle", "Circel")}, "no 'Circel' in .*did you mean 'Circle'"),
-        ({"code": code.replace("Circle", "NoProgram"), "options": {}}, r"program\.code: .* makes no coopenv\.backends"),
+        ({"code": code.replace("Circle", "NoProgram"), "options": {}}, r"program\.code: .* makes no coopenv\.sources"),
         ({"options": {"radios": 1.0}}, r"program\.code: .*: TypeError: .*radios"),
     ):
         with pytest.raises(CoopenvError, match=why):

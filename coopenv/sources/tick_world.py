@@ -7,7 +7,14 @@ from typing import Any, NoReturn, cast
 
 import numpy as np
 
-from coopenv.backends.base import (
+from coopenv.base.errors import CoopenvError
+from coopenv.estimation.poses import exp_so3, exp_translation
+from coopenv.observers.contract import Message, ObserverInit
+from coopenv.observers.kernel_observer import views_of
+from coopenv.observers.recording import MEASURED, Sensed, check_tick, is_due
+from coopenv.observers.registry import find_embedded
+from coopenv.observers.runner import start_covariances
+from coopenv.sources.base import (
     Backend,
     Broadcasting,
     Command,
@@ -17,14 +24,7 @@ from coopenv.backends.base import (
     WorldBackend,
     is_valid_message,
 )
-from coopenv.backends.feed import RECORDED, Feed, unknown_truth
-from coopenv.base.errors import CoopenvError
-from coopenv.estimation.poses import exp_so3, exp_translation
-from coopenv.observers.contract import Message, ObserverInit
-from coopenv.observers.kernel_observer import views_of
-from coopenv.observers.recording import MEASURED, Sensed, check_tick, is_due
-from coopenv.observers.registry import find_embedded
-from coopenv.observers.runner import start_covariances
+from coopenv.sources.feed import RECORDED, Feed, unknown_truth
 from coopenv.world.embedded import HOST
 from coopenv.world.state import fields, state_fields
 from coopenv.world.world import Keys, Options
