@@ -26,9 +26,9 @@ from coopenv.base.errors import EVALUATION_SEEDS
 from coopenv.base.format import in_parentheses
 from coopenv.bench.observers.changes import DIRECTION
 from coopenv.bench.observers.rows import standard_error
-from coopenv.bench.pages import table
 from coopenv.estimation.poses import Array
 from coopenv.observers.registry import find_embedded
+from coopenv.report.table import markdown
 from coopenv.runs.console import Progress
 
 SCENE = "busy_intersection_tracking"
@@ -312,7 +312,7 @@ def table_of(results: Results) -> str:
         found = [results[name, odometry, observer] for observer in OBSERVERS]
         cells = [", ".join(map(_with_error, (each.mean, each.worst))) for each in found]
         rows.append([name, "" if name == "none" else odometry, *cells])
-    return table(["attack", "odometry", *(f"`{name}`" for name in OBSERVERS)], rows)
+    return markdown(["attack", "odometry", *(f"`{name}`" for name in OBSERVERS)], rows)
 
 
 def _with_error(values: Array) -> str:

@@ -31,11 +31,12 @@ from coopenv.base.errors import CoopenvError, ScenarioWarning, check_one_of, wor
 from coopenv.base.files import replace_text
 from coopenv.base.format import in_parentheses, json_text
 from coopenv.base.installation import version
-from coopenv.bench.pages import fingerprint
 from coopenv.observers.registry import find_embedded, list_observers
+from coopenv.report.table import markdown
 from coopenv.runs.console import Progress
 from coopenv.scenario import Scenario
 from coopenv.viz import style
+from sitegen.environments.sensing import fingerprint
 
 OBSERVERS = (
     "robust",
@@ -213,12 +214,6 @@ def exponent(rows: Sequence[dict[str, Any]], key: str) -> float:
     return float(np.polyfit(np.log([row["present"] for row in rows]), np.log([row[key] for row in rows]), 1)[0])
 
 
-def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table in Markdown."""
-    lines = (f"| {' | '.join(row)} |" for row in (columns, ["---"] * len(columns), *rows))
-    return "\n".join(lines)
-
-
 def observers_table(studies: Sequence[dict[str, Any]]) -> str:
     """Return the table of the observers."""
     columns = (
@@ -238,7 +233,7 @@ def observers_table(studies: Sequence[dict[str, Any]]) -> str:
         values = [in_parentheses(*(scale * x for x in row[name])) for name, scale in scales.items()]
         return [f"`{row['observer']}`", *values, f"{row['cpu_s_per_s']:.2g}"]
 
-    return table(columns, [cells(row) for row in studies])
+    return markdown(columns, [cells(row) for row in studies])
 
 
 def distance_table(studies: Sequence[dict[str, Any]]) -> str:
@@ -251,7 +246,7 @@ def distance_table(studies: Sequence[dict[str, Any]]) -> str:
             e["median_error"] and in_parentheses(*(100.0 * x for x in e["median_error"])) for e in row["by_distance"]
         ]
         rows.append([f"`{row['observer']}`", *(cell or "-" for cell in cells)])
-    return table(["median error [cm] by distance [m]", *names], rows)
+    return markdown(["median error [cm] by distance [m]", *names], rows)
 
 
 def size_table(rows: Sequence[dict[str, Any]]) -> str:
@@ -279,7 +274,7 @@ def size_table(rows: Sequence[dict[str, Any]]) -> str:
         ]
         for row in rows
     ]
-    return table(columns, cells)
+    return markdown(columns, cells)
 
 
 def draw(studies: Sequence[dict[str, Any]], sizes: Sequence[dict[str, Any]], path: Path) -> None:

@@ -30,7 +30,7 @@ from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.files import replace_text
 from coopenv.base.format import json_text
-from coopenv.bench.pages import table
+from coopenv.report.table import markdown
 from coopenv.scenario import load_scenario
 from coopenv.sources.feed import COSIMULATED, RECORDED
 from coopenv.world.launch import Launcher, PerWorld, kernel
@@ -217,7 +217,7 @@ def report(rows: Rows) -> str:
         most = {key: max(row[key] for row in own) for key in own[0] if key not in ("module", "arch")}
         seconds = f"{most['ptx_s'] + most['ptxas_s']:.0f}"
         cells.append([f"`{name}`", seconds, *(str(most[key]) for key in ("registers", "stack", "spills"))])
-    return table(["module", "compile [s]", "registers", "stack [B]", "spills [B]"], cells)
+    return markdown(["module", "compile [s]", "registers", "stack [B]", "spills [B]"], cells)
 
 
 def put(rows: Rows, page: Path, known: Collection[str]) -> None:

@@ -25,11 +25,11 @@ from coopenv.base.format import in_parentheses
 from coopenv.base.installation import scenario_path
 from coopenv.bench.observers.faults import variant_of
 from coopenv.bench.observers.rows import standard_error
-from coopenv.bench.pages import table
 from coopenv.estimation.poses import Array
 from coopenv.observers import run
 from coopenv.observers.recording import Recording
 from coopenv.observers.robust import constants
+from coopenv.report.table import markdown
 from coopenv.runs import record
 from coopenv.scenario import Scenario, load_scenario, parse_scenario
 
@@ -254,7 +254,7 @@ def scenes(seeds: Sequence[int], jobs: int) -> str:
             cells.append(_both(*((row.anees, row.anees_se) for row in (own[0], own[-1]))))
             rows.append([f"`{scene}`", f"`{observer}`", *cells])
             print(" | ".join(rows[-1]), file=sys.stderr, flush=True)
-    return table(["scene", "observer", "5-10 s: median, worst", "after 35 s", "ANEES: least, largest"], rows)
+    return markdown(["scene", "observer", "5-10 s: median, worst", "after 35 s", "ANEES: least, largest"], rows)
 
 
 def _both(first: tuple[float, float], second: tuple[float, float]) -> str:
@@ -273,7 +273,7 @@ def undeclared(seeds: Sequence[int], jobs: int) -> str:
                 anees = _compact(found.anees.mean(axis=0).max())
                 rows[name].append(f"{found.mean}, {found.error.max():.2g} ({anees})")
             print(" | ".join(rows[name]), file=sys.stderr, flush=True)
-    return table(heads, list(rows.values()))
+    return markdown(heads, list(rows.values()))
 
 
 def merged(seeds: Sequence[int], jobs: int) -> str:
@@ -287,7 +287,7 @@ def merged(seeds: Sequence[int], jobs: int) -> str:
         rows.append([name, *cells, found.exceeded])
         print(" | ".join(rows[-1]), file=sys.stderr, flush=True)
     heads = [head for observer in CHANGED_OBSERVERS for head in (f"`{observer}`", "overconfident")]
-    return table(["error", *heads, "level exceeded"], rows)
+    return markdown(["error", *heads, "level exceeded"], rows)
 
 
 def levels(seeds: Sequence[int], jobs: int) -> str:
@@ -299,7 +299,7 @@ def levels(seeds: Sequence[int], jobs: int) -> str:
             found = outcome(recordings, fault, "robust", FAULT_SHARE * scenario.horizon)
             rows[name].append(found.levels)
             print(" | ".join(rows[name]), file=sys.stderr, flush=True)
-    return table(["error", "tracking", "road", "merging"], list(rows.values()))
+    return markdown(["error", "tracking", "road", "merging"], list(rows.values()))
 
 
 MASK_SCENES, MASKS = ("lane:20", "tree:20", "random:20,seed=3"), (64, 8)
@@ -312,7 +312,7 @@ def masks(seeds: Sequence[int], jobs: int) -> str:
     for bits in MASKS:  # a process for each, because kernels are compiled with the number
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
             rows.append([str(bits), *pool.map(_masked, [(bits, scene, tuple(seeds)) for scene in MASK_SCENES])])
-    return table(["bits", *MASK_SCENES], rows)
+    return markdown(["bits", *MASK_SCENES], rows)
 
 
 def _masked(given: tuple[int, str, Sequence[int]]) -> str:

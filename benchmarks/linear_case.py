@@ -14,7 +14,7 @@ from rich.console import Console
 
 from coopenv.estimation.poses import Array
 from coopenv.observers.robust.constants import RETURNING_SHARE
-from coopenv.runs.console import number_table
+from coopenv.report.table import Table
 
 SOURCES = 512
 """Most independent sources of an example."""
@@ -248,14 +248,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print both tables; return the exit status."""
     argparse.ArgumentParser(prog="python -m benchmarks.linear_case", description=__doc__).parse_args(arguments)
     console = Console(markup=False, highlight=False)
-    table = number_table(["\nexample"], ["own variance,\ntrue / stated", "largest\nratio"])
+    table = Table.of_texts(["\nexample"], ["own variance,\ntrue / stated", "largest\nratio"])
     for name, build in EXAMPLES.items():
-        table.add_row(name, *(f"{ratio:.3f}" for ratio in build().ratios()))
+        table.add(name, *(f"{ratio:.3f}" for ratio in build().ratios()))
     console.print(table)
-    table = number_table(["variance of\nthe sender"], ["\nframes", "\nodometry", "\nsender", "\nlandmark"])
+    table = Table.of_texts(["variance of\nthe sender"], ["\nframes", "\nodometry", "\nsender", "\nlandmark"])
     for sender in (1e-9, 0.1, 1.0):
         for frames in (1, 10, 100):
-            table.add_row(f"{sender:g}", str(frames), *(f"{mean:.3f}" for mean in monitor(frames, sender)))
+            table.add(f"{sender:g}", str(frames), *(f"{mean:.3f}" for mean in monitor(frames, sender)))
     console.print("\nMean of the monitors' statistic without a fault", table, sep="\n")
     return 0
 

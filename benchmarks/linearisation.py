@@ -19,7 +19,8 @@ from rich.console import Console
 
 from coopenv.base.format import in_parentheses
 from coopenv.estimation.poses import Array
-from coopenv.runs.console import Progress, number_table
+from coopenv.report.table import Table
+from coopenv.runs.console import Progress
 from coopenv.viz import style
 
 POINTS = {"prediction": 0.0, "midpoint": 0.5, "correction": 1.0, "constrained": 0.0}
@@ -182,7 +183,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("error: expected an even number of seeds, 4 at least, and 5 s at least", file=sys.stderr)
         return 2
     cases = [(scene, point, variance) for variance in (False, True) for scene in SCENES for point in POINTS]
-    table = number_table(["\nscene", "\nlinearised at", "\nvariance"], ["range bias\n[cm]", "ANEES\n"])
+    table = Table.of_texts(["\nscene", "\nlinearised at", "\nvariance"], ["range bias\n[cm]", "ANEES\n"])
     results = {}
     with Progress(Console(stderr=True), "simulating", total=len(cases)) as progress:
         for done, (scene, point, variance) in enumerate(cases):
@@ -190,7 +191,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             looks = simulate(scene, point, asked.seeds, asked.seconds, variance, asked.scale)
             results[scene, point, variance], last = looks, looks[-1]
             bias = in_parentheses(100 * last.bias, 100 * last.bias_error)
-            table.add_row(scene, point, "12 s" if variance else "-", bias, in_parentheses(last.anees, last.anees_error))
+            table.add(scene, point, "12 s" if variance else "-", bias, in_parentheses(last.anees, last.anees_error))
     Console(markup=False, highlight=False).print(table, f"After {last.time:g} s, {asked.seeds} seeds.", sep="\n")
     if asked.figure is not None:
         drawn(results, asked.figure)

@@ -16,7 +16,8 @@ import numpy as np
 from rich.console import Console
 
 from coopenv.base.format import in_parentheses
-from coopenv.runs.console import Progress, number_table
+from coopenv.report.table import Table
+from coopenv.runs.console import Progress
 
 POINTS = {"prediction": 0.0, "midpoint": 0.5, "correction": 1.0}
 TIMES = (0.0, 12.0)
@@ -95,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(json.dumps(measure(asked.variant[0], float(asked.variant[1]), asked.worlds)))
         return 0
     cases = [(point, time) for time in TIMES for point in POINTS]
-    table = number_table(["\nscene", "\nlinearised at", "\nvariance"], ["range bias\n[cm]", "ANEES\n"])
+    table = Table.of_texts(["\nscene", "\nlinearised at", "\nvariance"], ["range bias\n[cm]", "ANEES\n"])
     with Progress(Console(stderr=True), "simulating", total=len(cases)) as progress:
         for done, (point, time) in enumerate(cases):
             progress.update(done)
@@ -112,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             result = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
             for scene, (bias, error, anees, spread) in json.loads(result.stdout.splitlines()[-1]).items():
                 cells = in_parentheses(100 * bias, 100 * error), in_parentheses(anees, spread)
-                table.add_row(scene, point, f"{time:g} s" if time else "-", *cells)
+                table.add(scene, point, f"{time:g} s" if time else "-", *cells)
     Console(markup=False, highlight=False).print(table, f"After {SECONDS} s, {asked.worlds} worlds.", sep="\n")
     return 0
 

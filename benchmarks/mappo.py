@@ -30,7 +30,7 @@ from benchmarks.machine import machine
 from benchmarks.training import mean_and_error
 from coopenv.api.make import parallel_env
 from coopenv.api.parallel_env import PlainInfos
-from coopenv.runs.console import number_table
+from coopenv.report.table import Table
 
 ITERATIONS = 6
 """Of an experiment, beside the first."""
@@ -140,12 +140,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parser.parse_args(arguments)
     torch.set_num_threads(1)
     found = np.array([[costs(*kind, asked, seed) for kind in KINDS] for seed in range(asked.rounds)])
-    table = number_table(["worlds"], ["steps/s", "ratio", "stepping worlds", "other collection", "updates"])
+    table = Table.of_texts(["worlds"], ["steps/s", "ratio", "stepping worlds", "other collection", "updates"])
     whole = found.sum(axis=2)
     for i, (_, worlds, *_) in enumerate(KINDS):
         shares = [f"{100 * share:.0f} %" for share in (found[:, i] / whole[:, i, None]).mean(axis=0)]
         rate, ratio = (mean_and_error(each) for each in (1.0 / whole[:, i], whole[:, 1] / whole[:, i]))
-        table.add_row(str(worlds), "{:.0f} ± {:.0f}".format(*rate), "{:.1f} ± {:.1f}".format(*ratio), *shares)
+        table.add(str(worlds), "{:.0f} ± {:.0f}".format(*rate), "{:.1f} ± {:.1f}".format(*ratio), *shares)
     out, place = Console(), machine()
     out.print(f"World steps per CPU second, {asked.rounds} experiments each, one thread; {place['processor']}.\n")
     out.print(table)

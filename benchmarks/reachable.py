@@ -29,7 +29,8 @@ from coopenv.evaluation import Episodes, drive, held_out_seeds
 from coopenv.evaluation.metrics import SETTLED_FROM
 from coopenv.policies import Policy, load_agent
 from coopenv.policies.base import decide, restart
-from coopenv.runs.console import Progress, number_table
+from coopenv.report.table import Table
+from coopenv.runs.console import Progress
 from coopenv.scenario import Scenario
 from coopenv.sources.sources import open_simulation
 
@@ -181,12 +182,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except CoopenvError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    table = number_table(("",), ["stated e95\n[cm]", "e95\n[cm]", "over the\nsearch", "arrived\n[%]", "collided\n[%]"])
+    headings = ["stated e95\n[cm]", "e95\n[cm]", "over the\nsearch", "arrived\n[%]", "collided\n[%]"]
+    table = Table.of_texts(("",), headings)
     for name, own in found.items():
         shares = 100.0 * own.arrived, 100.0 * own.collided
         values = 100.0 * own.stated, 100.0 * own.e95, own.e95 / found[SEARCH].e95, *shares
         cells = zip(values, (1, 1, 2, 0, 0), strict=True)
-        table.add_row(name, *(f"{v.mean():.{digits}f}\n±{standard_error(v):.{digits}f}" for v, digits in cells))
+        table.add(name, *(f"{v.mean():.{digits}f}\n±{standard_error(v):.{digits}f}" for v, digits in cells))
     console = Console()
     console.print(f"{asked.environment}: mean over {asked.worlds} worlds of block {asked.block}, with standard errors.")
     console.print(table)

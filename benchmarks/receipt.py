@@ -28,7 +28,7 @@ from rich.console import Console
 from benchmarks.options import at_least
 from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.base.format import in_parentheses
-from coopenv.bench.pages import table
+from coopenv.report.table import markdown
 from coopenv.runs.console import Progress
 
 AT = 12.0
@@ -303,7 +303,7 @@ def part_table(results: dict[str, dict[str, Any]]) -> str:
         "CPU per update, us",
         *results["nothing"]["rmse"],
     ]
-    return table(heads, rows)
+    return markdown(heads, rows)
 
 
 def constant_table(results: dict[str, dict[str, Any]]) -> str:
@@ -316,7 +316,7 @@ def constant_table(results: dict[str, dict[str, Any]]) -> str:
         worst = max(faults, key=lambda case: np.mean(rmse[case]) / np.mean(base[case]))
         cells = [_ratio(rmse, base, cases) for cases in (nominal, faults, [worst])]
         rows.append([variant, *cells, worst, f"{found['exclusions'] / found['hours']:.1f}"])
-    return table(["number", "without fault", "faults, mean", "worst fault", "which", "false exclusions, 1/h"], rows)
+    return markdown(["number", "without fault", "faults, mean", "worst fault", "which", "false exclusions, 1/h"], rows)
 
 
 def _ratio(rmse: Mapping[str, Any], base: Mapping[str, Any], cases: Sequence[str]) -> str:

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.learning.study import place_of, read_study
 from coopenv.api.engine import Engine
 from coopenv.base.installation import data_directory
-from coopenv.bench.learning import place_of, read_study
 from coopenv.evaluation import drive, held_out_seeds, score
 from coopenv.evaluation.metrics import interval, scored_errors
 from coopenv.policies import load_agent

@@ -25,7 +25,7 @@ from rich.console import Console
 from rllib_env import CooperativeRows
 
 from benchmarks.machine import machine
-from coopenv.runs.console import number_table
+from coopenv.report.table import Table
 
 NODES = (1, 2)
 NAMES = ("training, by the clock", "training, by CPU time", "sampling, by CPU time", "learning, by CPU time")
@@ -90,11 +90,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for _ in range(asked.rounds)
         ]
     )  # (rounds, nodes, 4)
-    table = number_table(["what"], ["one node", "two nodes", "ratio"])
+    table = Table.of_texts(["what"], ["one node", "two nodes", "ratio"])
     for name, (one, two) in zip(NAMES, np.moveaxis(rates, (2, 1), (0, 1)), strict=True):
         ratio = two / one
         error = ratio.std(ddof=1) / math.sqrt(len(ratio)) if len(ratio) > 1 else math.nan
-        table.add_row(name, f"{one.mean():,.0f}/s", f"{two.mean():,.0f}/s", f"{ratio.mean():.2f} ± {error:.2f}")
+        table.add(name, f"{one.mean():,.0f}/s", f"{two.mean():,.0f}/s", f"{ratio.mean():.2f} ± {error:.2f}")
     place = machine()
     out = Console()
     out.print(f"{place['processor']}, {place['cores_available']} cores, load {place['load_average_at_start']:.1f}\n")

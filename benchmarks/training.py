@@ -25,7 +25,7 @@ from benchmarks.machine import machine
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import data_directory
 from coopenv.cli.options import parse_overrides
-from coopenv.runs.console import number_table
+from coopenv.report.table import Table
 from coopenv.training.command import possible
 from coopenv.training.settings import SETTINGS_FILE, TrainingPlan, read_settings
 from coopenv.training.trainer import Trainer
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     torch.set_num_threads(1)
     out, place = Console(), machine()
     heads = ["SB3\nsteps/s", "coopenv\nsteps/s", "\nratio", "trainer\nalone", "of SB3's,\nenvironment"]
-    table = number_table(["\nenvironment"], heads)
+    table = Table.of_texts(["\nenvironment"], heads)
     try:
         overrides = parse_overrides(asked.set)
         for name in asked.environments:
@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rates = [f"{1e-3 / cost:.1f} k" for cost in whole.mean(axis=0)]
             ratios = [mean_and_error(cost[:, 0] / cost[:, 1]) for cost in (whole, whole - world)]
             shown = [f"{mean:.2f} ± {error:.2f}" for mean, error in ratios]
-            table.add_row(name, *rates, *shown, f"{100 * (world / whole)[:, 0].mean():.0f} %")
+            table.add(name, *rates, *shown, f"{100 * (world / whole)[:, 0].mean():.0f} %")
     except CoopenvError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

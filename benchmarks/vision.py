@@ -21,7 +21,7 @@ from coopenv.base.sections import FAMILIES
 from coopenv.cars.frames import WALL, FrameRenderer, PlacedTag
 from coopenv.cars.vision import Calibration, find_tags
 from coopenv.estimation.poses import Array
-from coopenv.runs.console import number_table
+from coopenv.report.table import Table
 
 CAMERA = Calibration((640, 480), (450.0, 455.0), (322.3, 236.1), (-0.30, 0.10, 0.002, 0.0006, 0.0))
 DISTANCES, TILTS = (1.0, 2.0, 3.0, 4.0), (0.0, 30.0, 60.0)
@@ -66,16 +66,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def report(asked: argparse.Namespace) -> None:
     """Print the table."""
     names = ("\nfound [%]", "bearing error\nRMSE [deg]", "\n99 % [deg]", "\nfalse", "CPU per frame\n[ms]", "\n99 %")
-    table = number_table([f"{asked.family}\ndistance [m]", "\ntilt [deg]"], names)
+    table = Table.of_texts([f"{asked.family}\ndistance [m]", "\ntilt [deg]"], names)
     renderer, every = FrameRenderer(CAMERA, asked.family), list[Measured]()
     for distance in DISTANCES:
         for tilt in TILTS:
             rng = np.random.default_rng([asked.seed, round(100 * distance), round(tilt)])
             every.append(measured(renderer, distance, tilt, asked.side, asked.frames, rng))
-            table.add_row(f"{distance:g}", f"{tilt:g}", *cells(every[-1]))
+            table.add(f"{distance:g}", f"{tilt:g}", *cells(every[-1]))
     whole = Measured(*(sum(m.placed for m in every), np.concatenate([m.errors for m in every])),
                      *(sum(m.false for m in every), np.concatenate([m.cpu for m in every])))  # fmt: skip
-    table.add_row("all", "", *cells(whole))
+    table.add("all", "", *cells(whole))
     Console().print(table)
 
 

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from coopenv.api.make import make_vec, parallel_env
     from coopenv.api.parallel_env import CooperativeLocalisationEnv
     from coopenv.api.vector_env import CooperativeVectorEnv
-    from coopenv.bench.cards import Evaluation
     from coopenv.bench.evaluate import evaluate
+    from coopenv.bench.evaluation import Evaluation
     from coopenv.bench.observers.comparison import Comparison, compare
     from coopenv.estimation.poses import position_covariance
     from coopenv.observers.registry import list_observers

@@ -5,9 +5,9 @@ import re
 from collections.abc import Iterator
 from pkgutil import resolve_name
 
-from coopenv.bench.pages import bullets, table
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.registry import ZooEntry, zoo
+from coopenv.report.table import bullets, markdown
 from sitegen.mirror import ROOT, relinked
 
 TABLE = "docs/observers.md"
@@ -29,7 +29,7 @@ def observers() -> Iterator[tuple[str, str]]:
     """Yield path and Markdown text of the pages of all observers, and of the one that lists them."""
     known = _rows()
     rows = [(f"[`{name}`]({name}_.md)", *known[name]) for name in zoo()]
-    yield "reference/observers/index.md", HEAD + table(("name", "what it is", "sends"), rows) + "\n"
+    yield "reference/observers/index.md", HEAD + markdown(("name", "what it is", "sends"), rows) + "\n"
     for name, entry in zoo().items():
         yield f"reference/observers/{name}_.md", _page(name, entry, *known[name])
 

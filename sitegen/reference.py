@@ -11,10 +11,10 @@ from pydantic.fields import FieldInfo
 from coopenv.base.installation import list_envs
 from coopenv.base.sections import Section
 from coopenv.bench.observers.rows import Row
-from coopenv.bench.pages import table
 from coopenv.cars.bags.topic_map import TopicMap
 from coopenv.cars.deployment import Deployment
 from coopenv.cars.profile import SVEA, CarProfile, Role
+from coopenv.report.table import markdown
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from coopenv.training.settings import Settings
 
@@ -49,7 +49,7 @@ def topics() -> str:
         name, kind = topic.name.removeprefix("fleet/").removeprefix("{car}/"), topic.type.replace("/msg/", "/")
         age = "" if topic.max_age is None else f"{topic.max_age:g}"
         rows.append((f"`{name}`", f"`{kind}`", sender, rate, age, content))
-    return table(("topic", "type", "from", "Hz", "max. age, s", "content"), rows)
+    return markdown(("topic", "type", "from", "Hz", "max. age, s", "content"), rows)
 
 
 def _reference(part: type[Section]) -> str:
@@ -57,7 +57,7 @@ def _reference(part: type[Section]) -> str:
     rows = [
         (f"`{key}`", _default(field), _values(field), " ".join(meaning.split())) for key, field, meaning in _keys(part)
     ]
-    return table(("key", "default", "values", "meaning"), rows)
+    return markdown(("key", "default", "values", "meaning"), rows)
 
 
 def _keys(part: type[Section], prefix: str = "") -> Iterator[tuple[str, FieldInfo, str]]:
@@ -110,18 +110,18 @@ def observation() -> str:
         row = (f"`{name}`", field.meaning, field.unit, scale, f"{field.center:.4g}", field.per, str(field.size), planar)
         groups.setdefault(field.group, []).append(row)
     for group, rows in groups.items():
-        parts += [f"## {group}", table(COLUMNS, rows)]
+        parts += [f"## {group}", markdown(COLUMNS, rows)]
     rewards = [
         (f"`{name}`", term.meaning + (" (uses the truth)" if term.privileged else ""), term.unit)
         for name, term in REWARD_TERMS.built_in.items()
     ]
     parts += ["## Terms of the reward", "`reward.weights.NAME` in a scenario weighs them; each counts per decision."]
-    return "\n\n".join([*parts, table(("term", "meaning", "unit"), rewards)])
+    return "\n\n".join([*parts, markdown(("term", "meaning", "unit"), rewards)])
 
 
 def comparison() -> str:
     """Return the columns of a comparison of observers, which its report explains in the same words."""
-    return table(("column", "meaning"), [(f"`{column.name}`", column.metadata["meaning"]) for column in fields(Row)])
+    return markdown(("column", "meaning"), [(f"`{column.name}`", column.metadata["meaning"]) for column in fields(Row)])
 
 
 TABLES: dict[str, Callable[[], str]] = {

@@ -28,7 +28,7 @@ from coopenv.base.format import (
     seconds,
     with_error,
 )
-from coopenv.base.terminal import NumberTable, text_of
+from coopenv.report.terminal import NumberTable, text_of
 
 
 class Unspeakable:

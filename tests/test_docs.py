@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
+from coopenv.bench.learning import read_study
 
 import coopenv
 from coopenv.api.arguments import FIELDS, OTHERS, Step
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import CoopenvError
-from coopenv.bench.learning import read_study
 from coopenv.cars.bags.topic_map import load_map
 from coopenv.cli.app import app
 from coopenv.policies import act, load_agent

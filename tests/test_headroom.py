@@ -10,11 +10,11 @@ from functools import cache
 
 import numpy as np
 import pytest
+from coopenv.bench.pages import cooperation_settings
 
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.bench.cards import Contest
-from coopenv.bench.pages import cooperation_settings
 from coopenv.evaluation import Difference, Episodes, compare_paired, drive, held_out_seeds, ranking_key, score
 from coopenv.evaluation.metrics import scored_errors
 from coopenv.policies import load_agent

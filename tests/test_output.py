@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from coopenv.base.terminal import Terminal
 from coopenv.cli import options
 from coopenv.cli.app import main
+from coopenv.report.terminal import Terminal
 from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, start
 
 AGENTS = """

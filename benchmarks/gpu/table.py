@@ -8,7 +8,7 @@ from typing import Any
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
 from coopenv.base.format import number
-from coopenv.bench.pages import table
+from coopenv.report.table import markdown
 
 BEGIN, END = "<!-- make gpu: begin -->", "<!-- make gpu: end -->"
 
@@ -51,7 +51,7 @@ def _throughput(results: dict[str, dict[str, Any]]) -> str:
         row = rows.setdefault(case, [case, memory, *[""] * len(sizes)])
         row[2 + sizes.index(result["worlds"])] = _rate(result["vehicle_ticks_per_s"])
     columns = ("vehicle ticks/s", "KiB/world", *(f"{size:,} world{'s' * (size > 1)}" for size in sizes))
-    return table(columns, list(rows.values())) if rows else ""
+    return markdown(columns, list(rows.values())) if rows else ""
 
 
 def _rate(value: float) -> str:

@@ -8,8 +8,8 @@ from itertools import product
 import numpy as np
 
 from benchmarks.methods.study import Results, StudyFile, improvement, rank, with_interval
-from coopenv.bench.pages import table
 from coopenv.evaluation.metrics import LOSSES
+from coopenv.report.table import markdown
 
 SHOWN = {
     "arrived [%]": ("arrival_rate", 100.0),
@@ -53,7 +53,7 @@ def page(study: StudyFile, results: Results) -> str:
         decisions=study.decisions,
         seeds=len(study.seeds),
         worlds=study.worlds,
-        methods=table(["method", ""], [[f"`{name}`", method.about] for name, method in study.methods.items()]),
+        methods=markdown(["method", ""], [[f"`{name}`", method.about] for name, method in study.methods.items()]),
         drivers=" and ".join(f"`{driver}` in `{place}`" for place, driver in study.environments.items()),
         noise=study.noise,
         base=next(iter(study.methods)),
@@ -88,7 +88,7 @@ def tables(study: StudyFile, results: Results) -> str:
             shown = ["" if chance is None else chance_text(chance), f"{spent:.1f}" if name in methods else ""]
             rows.append([f"`{name}`", *cells, *shown])
         heads = [f"`{place}`", *SHOWN, "better", "CPU [min]"]
-        parts.append(table(heads, rows))
+        parts.append(markdown(heads, rows))
     return "\n\n".join([*parts, verdict(ranks)])
 
 

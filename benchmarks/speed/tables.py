@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from textwrap import wrap
 
-from rich.table import Table
-
 from benchmarks.speed.cases import COOPENV
 from benchmarks.speed.coopenv_cases import BATCH, SINGLE
 from benchmarks.speed.growth import Growth
 from benchmarks.speed.measure import Result
 from benchmarks.speed.peer_cases import VMAS
 from benchmarks.speed.startup import Startup
-from coopenv.runs.console import number_table
+from coopenv.report.table import Table
 
 CASE_WIDTH = 24
 """Columns of a case's name; the longest is highway-env's."""
@@ -42,18 +40,18 @@ def short(dtype: str) -> str:
 
 def speed_table(results: list[Result]) -> Table:
     """Return rates per second of every case."""
-    table = number_table(["case"], ["worlds", "cores", "type", "env\nsteps/s", "agent\nsteps/s", "vehicle\nticks/s"])
+    table = Table.of_texts(["case"], ["worlds", "cores", "type", "env\nsteps/s", "agent\nsteps/s", "vehicle\nticks/s"])
     silent: set[str] = set()
     for result in results:
         case = result.case
         if result.problem:
             if case.name not in silent:
                 reason = wrap(result.problem, CASE_WIDTH - 2, max_lines=REASON_LINES, placeholder=" ...")
-                table.add_row("\n  ".join([case.name, *reason]), *["-"] * 6)
+                table.add("\n  ".join([case.name, *reason]), *["-"] * 6)
             silent.add(case.name)
             continue
         rates = (result.env_steps_per_s, result.agent_steps_per_s, result.vehicle_ticks_per_s)
-        table.add_row(case.name, str(case.worlds), str(case.threads), short(case.dtype), *map(count, rates))
+        table.add(case.name, str(case.worlds), str(case.threads), short(case.dtype), *map(count, rates))
     return table
 
 
@@ -107,18 +105,18 @@ def _comparable(ours: Result, peer: Result) -> bool:
 
 def ratio_table(found: list[Ratio]) -> Table:
     """Return how many times a peer's rates coopenv's are, per number of threads."""
-    table = number_table(
+    table = Table.of_texts(
         ["peer (1 core)", "against"], ["worlds", "cores", "env\nsteps", "agent\nsteps", "vehicle\nticks"]
     )
     for r in found:
         rates = (r.env_steps, r.agent_steps, r.vehicle_ticks)
-        table.add_row(r.peer, r.ours, str(r.worlds), str(r.threads), *map(times, rates))
+        table.add(r.peer, r.ours, str(r.worlds), str(r.threads), *map(times, rates))
     return table
 
 
 def memory_table(results: list[Result]) -> Table:
     """Return the memory per world of each case's largest batch, one thread."""
-    table = number_table(["case"], ["worlds", "type", "arrays\nKiB/world", "resident\nKiB/world"])
+    table = Table.of_texts(["case"], ["worlds", "type", "arrays\nKiB/world", "resident\nKiB/world"])
     largest: dict[tuple[str, str], Result] = {}
     for result in results:
         case = result.case
@@ -129,7 +127,7 @@ def memory_table(results: list[Result]) -> Table:
             largest[case.name, case.dtype] = result
     for (name, dtype), result in largest.items():
         row = result.row()
-        table.add_row(
+        table.add(
             name,
             str(result.case.worlds),
             short(dtype),
@@ -144,7 +142,7 @@ def _kibibytes(size: float | None) -> str:
 
 def startup_table(startup: Startup) -> Table:
     """Return seconds until the first step."""
-    table = number_table(
+    table = Table.of_texts(
         ["library"],
         ["import", "first step f32,\nempty cache", "first step f64,\nempty cache", "f32,\ncached", "f64,\ncached"],
     )
@@ -154,13 +152,13 @@ def startup_table(startup: Startup) -> Table:
             for kind in (startup.compiling, startup.cached)
             for dtype in ("float32", "float64")
         ]
-        table.add_row(name, f"{seconds:.2f} s", *("-" if s is None else f"{s:.2f} s" for s in found))
+        table.add(name, f"{seconds:.2f} s", *("-" if s is None else f"{s:.2f} s" for s in found))
     return table
 
 
 def growth_table(found: list[Growth]) -> Table:
     """Return how the CPU time of a step of all worlds grows: cost ~ size ^ exponent."""
-    table = number_table(
+    table = Table.of_texts(
         ["what grows"],
         ["from", "to", "step at\nfirst [ms]", "step at\nlast [ms]", "exponent\n(all)", "exponent\n(large)"],
         gap=0,
@@ -168,5 +166,5 @@ def growth_table(found: list[Growth]) -> Table:
     for g in found:
         ends = (f"{1e3 * cost:.3g}" for cost in (g.costs[0], g.costs[-1]))
         exponents = (f"{law.exponent:.2f}" for law in (g.overall, g.large))
-        table.add_row(g.sweep.label, f"{g.sizes[0]:,}", f"{g.sizes[-1]:,}", *ends, *exponents)
+        table.add(g.sweep.label, f"{g.sizes[0]:,}", f"{g.sizes[-1]:,}", *ends, *exponents)
     return table

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from benchmarks.machine import machine
 from benchmarks.options import at_least
@@ -22,7 +21,8 @@ from benchmarks.stages.rounds import alternate, ratio
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.cli.options import load, parse_overrides
-from coopenv.runs.console import Progress, number_table
+from coopenv.report.table import Table
+from coopenv.runs.console import Progress
 
 SENSED = {"topology.mode": "sensed"}
 RICCATI, ROBUST = {"observer.name": "riccati"}, {"observer.name": "robust"}
@@ -80,7 +80,7 @@ def whole_table(asked: argparse.Namespace, extra: dict[str, Any], log: Console) 
     cases = [Case(name, asked.worlds, asked.dtype, {**overrides, **extra}) for name, overrides in TOTALS]
     checkouts = {"other": asked.against.resolve(), "this": HERE} if asked.against else {"this": HERE}
     more = ["this / other", "middle half\nof rounds"] if asked.against else []
-    table = number_table(["make_vec"], [*checkouts, *more])
+    table = Table.of_texts(["make_vec"], [*checkouts, *more])
     with ExitStack() as stack:
         sides = [stack.enter_context(Side(checkout, cases)) for checkout in checkouts.values()]
         with Progress(log, "building"):
@@ -93,7 +93,7 @@ def whole_table(asked: argparse.Namespace, extra: dict[str, Any], log: Console) 
                 if asked.against:
                     share, low, high = ratio(times[:, 1], times[:, 0])
                     cells += [f"{share:.3f}", f"{low:.3f}..{high:.3f}"]
-                table.add_row(case.name, *cells)
+                table.add(case.name, *cells)
                 progress.advance()
     return table
 
@@ -113,11 +113,11 @@ def stage_table(asked: argparse.Namespace, overrides: dict[str, Any], log: Conso
     with Progress(log, "measuring"):
         times = 1e9 * alternate([partial(step, asked.decisions) for step in steps], asked.rounds)
     headings = ["cost\n[ns]", "middle half\nof rounds", "left with-\nout it [ns]"]
-    table = number_table([f"stage ({asked.environment})"], headings)
-    table.add_row("whole tick", "", "", f"{np.median(times[:, 0]):.0f}")
+    table = Table.of_texts([f"stage ({asked.environment})"], headings)
+    table.add("whole tick", "", "", f"{np.median(times[:, 0]):.0f}")
     for name, before, after in zip(names, times.T, times.T[1:], strict=False):
         low, high = np.quantile(before - after, (0.25, 0.75))
-        table.add_row(name, f"{np.median(before - after):.0f}", f"{low:.0f}..{high:.0f}", f"{np.median(after):.0f}")
+        table.add(name, f"{np.median(before - after):.0f}", f"{low:.0f}..{high:.0f}", f"{np.median(after):.0f}")
     return table
 
 
@@ -125,13 +125,13 @@ def compile_table(asked: argparse.Namespace, log: Console) -> Table:
     """Return the time of the first step with an empty kernel cache, of both checkouts, in turn."""
     kinds: list[tuple[str, dict[str, Any]]] = [("float32", {}), ("float64", {}), ("float32", ROBUST)]
     cases = [Case("busy_intersection", 1, dtype, overrides) for dtype, overrides in kinds]
-    table = number_table(["first step, empty cache"], ["other [s]", "this [s]", "this / other"])
+    table = Table.of_texts(["first step, empty cache"], ["other [s]", "this [s]", "this / other"])
     with Progress(log, "compiling", total=len(cases)) as progress:
         for case in cases:
             sides = [partial(compile_seconds, checkout, case) for checkout in (asked.against.resolve(), HERE)]
             times = alternate(sides, asked.compiles)
             other, this = np.median(times, axis=0)
-            table.add_row(f"{case.name}, {case.dtype}", f"{other:.1f}", f"{this:.1f}", f"{this / other:.2f}")
+            table.add(f"{case.name}, {case.dtype}", f"{other:.1f}", f"{this:.1f}", f"{this / other:.2f}")
             progress.advance()
     return table
 

@@ -120,7 +120,7 @@ def measure(asked: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory() as folder:
         os.environ["WARP_CACHE_PATH"] = folder  # these kernels serve this process only
         import coopenv
-        from coopenv.runs.console import number_table
+        from coopenv.report.table import Table
 
         counters = count_cycles(Path(folder))
         env = coopenv.make_vec(asked.environment, num_worlds=asked.worlds, threads=1, overrides=overrides)
@@ -136,11 +136,11 @@ def measure(asked: argparse.Namespace) -> None:
             if n >= round(asked.start):
                 rows.append(1e9 * spent * cycles / cycles.sum())
     means, errors = np.mean(rows, axis=0), np.std(rows, axis=0, ddof=1) / len(rows) ** 0.5
-    table = number_table([f"stage ({asked.environment})"], ["ns per tick", "standard error", "share"])
+    table = Table.of_texts([f"stage ({asked.environment})"], ["ns per tick", "standard error", "share"])
     names = [name for name, _ in STAGES]
     for name, mean, error in zip(["all else", *names], means, errors, strict=True):
-        table.add_row(name, f"{mean:.0f}", f"{error:.0f}", f"{mean / means.sum():.2f}")
-    table.add_row("sum", f"{means.sum():.0f}", "", "1.00")
+        table.add(name, f"{mean:.0f}", f"{error:.0f}", f"{mean / means.sum():.2f}")
+    table.add("sum", f"{means.sum():.0f}", "", "1.00")
     Console(markup=False, highlight=False).print(table)
 
 

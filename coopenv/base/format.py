@@ -55,6 +55,11 @@ def seconds(values: Sequence[float]) -> list[str]:
     return ["never" if math.isnan(value) else f"{value:.2f}" for value in values]
 
 
+def three_digits(values: Sequence[float]) -> list[str]:
+    """Return numbers with three significant digits each."""
+    return [number(value, 3) for value in values]
+
+
 def with_error(value: float, error: float) -> tuple[str, str]:
     """Return a number and its standard error to the same decimal, the first digit of the error; no error for NaN."""
     if not (math.isfinite(value) and math.isfinite(error)):

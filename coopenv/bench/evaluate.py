@@ -20,11 +20,12 @@ from coopenv.base.errors import explained
 from coopenv.base.files import check_new, replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import names_of, version, versions
-from coopenv.base.terminal import Terminal
-from coopenv.bench.cards import KINDS, Contest, Evaluation
+from coopenv.bench.contest import Contest
+from coopenv.bench.evaluation import KINDS, Evaluation, evaluated
 from coopenv.evaluation import METRICS, held_out_seeds
 from coopenv.evaluation.episodes import Episodes
 from coopenv.evaluation.metrics import SCORE, Quantile, interval, resamples
+from coopenv.report.terminal import Terminal
 from coopenv.runs import films
 from coopenv.runs.command import REPLAY_FILE
 from coopenv.runs.console import Progress, compile_notice
@@ -94,7 +95,7 @@ def run(
 
     def driven() -> Evaluation:
         with Progress(log, "driving", total=len(contest.entrants)) as progress, compile_notice(log):
-            return contest.drive(lambda done, name: progress.update(done, f"driving: {name}"))
+            return evaluated(contest, lambda done, name: progress.update(done, f"driving: {name}"))
 
     if out is None:
         return driven()

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.table import Table
 
 from coopenv.base.errors import CoopenvError, ScenarioWarning, check_one_of, listed
 from coopenv.base.format import in_parentheses, jsonable, number
@@ -33,7 +32,7 @@ from coopenv.bench.observers.tables import mean_of, short_name
 from coopenv.estimation.metrics import DIVERGED_POSITION
 from coopenv.observers.isolation import Isolated, load
 from coopenv.observers.registry import check_known, find, list_observers, zoo
-from coopenv.runs.console import number_table
+from coopenv.report.table import Table
 
 FOLDER = Path(__file__).parent
 TOLERANCE = 1e-3
@@ -280,23 +279,23 @@ def report(benchmark: Frozen, result: Mapping[str, Any]) -> Iterator[Table | str
     own = {row["observer"] for row in result["rows"]}
     zoo = [row for row in benchmark.zoo["rows"] if row["scene"] in result["scenes"] and row["observer"] not in own]
     numbers = ["RMSE\n[m]", "median\nvehicle", "worst\nvehicle", "above\n5 m", "failed", "\nANEES", "worst\nANEES"]
-    totals = number_table([f"bench {benchmark.version}"], [*numbers, "sent\nB/s", "\nus"])
+    totals = Table.of_texts([f"bench {benchmark.version}"], [*numbers, "sent\nB/s", "\nus"])
     for total in totals_of([*result["rows"], *zoo]):
         figures = [number(total[key], 3) for key in ("median_m", "worst_m")]
         counts = [str(total[key]) for key in ("above", "failed")]
         costs = [number(total[key], 2) for key in COSTS]
         mark = "* " if total["observer"] in own else ""
         error = in_parentheses(total["rmse_m"], total["rmse_se_m"])
-        totals.add_row(mark + total["observer"], error, *figures, *counts, *costs)
+        totals.add(mark + total["observer"], error, *figures, *counts, *costs)
     yield totals
     yield f"*: new. Geometric means over {len(result['scenes'])} scenes; failures and errors above 5 m count as 5 m.\n"
     names = [*own, *(name for name in SHOWN if any(row["observer"] == name for row in zoo))]
     cells = {(row["scene"], row["observer"]): row for row in [*zoo, *result["rows"]]}
-    scenes = number_table(["RMSE [m]"], ["bound", *map(short_name, names)])
+    scenes = Table.of_texts(["RMSE [m]"], ["bound", *map(short_name, names)])
     for scene in result["scenes"]:
         of = [cells[scene, name] for name in names]
         errors = ["failed" if row["failure"] else in_parentheses(row["rmse_m"], row["rmse_se_m"]) for row in of]
-        scenes.add_row(scene, "-" if of[0]["bound_m"] is None else number(of[0]["bound_m"], 3), *errors)
+        scenes.add(scene, "-" if of[0]["bound_m"] is None else number(of[0]["bound_m"], 3), *errors)
     yield scenes
     failures: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for row in result["rows"]:

@@ -154,66 +154,6 @@ for command in (view, film, watch, play):
     app.command(rich_help_panel=VIEW)(command)
 
 
-@app.command(rich_help_panel=VIEW)
-def page(
-    environments: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="ENV...",
-            help="Names of environments or TOML files.",
-            show_default=False,
-            autocompletion=options.environments,
-            callback=options.known_environments,
-        ),
-    ] = None,
-    everything: Annotated[bool, typer.Option("--all", help="Every environment that ships with coopenv.")] = False,
-    out: Annotated[Path, typer.Option(help="Folder for ENV.md, ENV.png and ENV.webp.")] = Path("out", "pages"),
-    measure: Annotated[
-        bool,
-        typer.Option(
-            "--measure",
-            help="Measure the value of sensing or cooperation for ENV.json; else that file is shown.",
-        ),
-    ] = False,
-    film: Annotated[
-        bool,
-        typer.Option("--film/--no-film", help="Film an episode for ENV.webp; else the film that is there is shown."),
-    ] = True,
-    worlds: Annotated[int, typer.Option(min=2, max=options.MOST_WORLDS, help="Held-out worlds to measure in.")] = 256,
-) -> None:
-    """Write the pages of environments: description, picture, film, value of sensing."""
-    from coopenv.base.files import replace_text
-    from coopenv.base.installation import list_envs
-    from coopenv.bench import pages
-    from coopenv.runs.console import Progress
-
-    if bool(environments) == everything:
-        raise CoopenvError("name environments, or give --all for those that ship with coopenv")
-    names = list_envs() if everything else list(environments or ())
-    stems = {Path(text).stem: text for text in names}
-    if len(stems) < len(names):
-        raise CoopenvError("two environments have the same name")
-    scenarios = {name: options.load(text, {}) for name, text in stems.items()}
-    measured = [name for name in stems if measure and (pages.measured_drivers(name) or not everything)]
-    for name in measured:
-        pages.contests(stems[name], scenarios[name], worlds)
-    pages.prepare(out, list(stems))
-    log = options.console(stderr=True)
-    with Progress(log, "pages", total=len(stems)) as progress:
-        for number, (name, scenario) in enumerate(scenarios.items()):
-            progress.update(number, name)
-
-            def report(done: float, doing: str = "film", number: int = number, name: str = name) -> None:
-                progress.update(number + done, f"{name}, {doing}")
-
-            if name in measured:
-                pages.write_figures(stems[name], scenario, out, worlds, report)
-            pages.write_page(name, scenario, out, report if film else None)
-    if shipped := {name: options.load(name, {}) for name in list_envs() if (out / f"{name}.md").is_file()}:
-        replace_text(out / pages.INDEX, pages.index_text(shipped))
-    options.console().print(f"Pages in {out}: {', '.join(f'{name}.md' for name in stems)}", soft_wrap=True)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status.
 

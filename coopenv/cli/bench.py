@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coopenv.base.errors import CoopenvError, listed
-from coopenv.base.installation import install_command, is_reference
+from coopenv.base.installation import is_reference
 from coopenv.cli import options
 
 if TYPE_CHECKING:
@@ -231,36 +231,3 @@ def bench_v1(
         raise CoopenvError("; ".join(result["refused"].values()))
     if lost := [total["observer"] for total in result["totals"] if total["failed"] == len(result["scenes"])]:
         raise CoopenvError(f"failed in every scene: {listed(lost)}")
-
-
-@bench.command("learning")
-def bench_learning(
-    study: Annotated[
-        Path,
-        typer.Argument(
-            help="TOML file of the study, such as agents/study.toml.", callback=options.existing("file of a study")
-        ),
-    ],
-    out: Annotated[Path | None, typer.Option(help="Folder for the agents (default: beside the study).")] = None,
-    only: Annotated[
-        str | None,
-        typer.Option(help="Part of it: environments, arms and seeds with commas between, such as facade,quality,1."),
-    ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Trainings side by side (default: one per core).")] = None,
-    worlds: Annotated[int, typer.Option(min=2, help="Number of held-out worlds for the cards.")] = 256,
-    logs: Annotated[Path, typer.Option(help="Folder for TensorBoard's files.")] = Path("out", "tensorboard"),
-) -> None:
-    """Train agents by environment, arm and seed, and write their cards; goes on where it was interrupted."""
-    from coopenv.base.installation import available_cores, needing
-
-    with needing(f"coopenv bench learning needs the extra train: {install_command('train')}"):
-        from coopenv.bench import learning
-
-    whole, log = learning.read_study(study), options.console(stderr=True)
-    chosen, folder = whole.only(options.words(only)), out or study.parent
-    for plans in chosen.agents.values():
-        options.load(plans[0].environment, plans[0].settings.scenario)
-    learning.run(whole, chosen, folder, logs, jobs or available_cores(), worlds, log)
-    printed = options.console()
-    printed.print(learning.results_table(chosen, folder))
-    printed.print("Figures of the best seed, with 95 % intervals over worlds. More in every agent's card.md.")

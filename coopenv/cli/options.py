@@ -397,7 +397,7 @@ class SourceOptions:
 
 def console(stderr: bool = False) -> Console:
     """Return a console that prints scenario texts as they are."""
-    from coopenv.base.terminal import Terminal
+    from coopenv.report.terminal import Terminal
 
     return Terminal(stderr=stderr)
 

@@ -212,6 +212,7 @@ OF_THE_OUTPUT = ("out", "figures", "width", "no_figures", "film", "write_card", 
 def evaluate(given: EvaluateOptions) -> None:
     """Compare agents on held-out worlds: arrivals, collisions, time, errors."""
     from coopenv.bench import cards, evaluate
+    from coopenv.bench.contest import Contest
 
     environment, agents, out, log = given.environment, given.agents, given.out, options.console(stderr=True)
     if given.film and out is None:
@@ -222,7 +223,7 @@ def evaluate(given: EvaluateOptions) -> None:
     if agents is not None and not names:
         raise CoopenvError(f"--agents {agents}: names no agent; leave it out for all agents of {environment}")
     changes = options.parse_overrides(given.overrides)
-    contest = cards.Contest.of(environment, changes, names, given.worlds, given.seed_block, given.ideal, given.stress)
+    contest = Contest.of(environment, changes, names, given.worlds, given.seed_block, given.ideal, given.stress)
     carded = cards.carded(contest) if given.write_card else []
     command = options.command_text("evaluate", given, OF_THE_OUTPUT)
     drawn = {

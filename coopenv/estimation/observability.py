@@ -36,12 +36,14 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Self, get_type_hin
 
 import numpy as np
 
-from coopenv.base.columns import Columns, Tabular, facts_html, one_line, picture_html
 from coopenv.base.errors import DataError, check_one_of
 from coopenv.base.files import replacing_file
 from coopenv.base.format import read_npz
 from coopenv.base.installation import load_reference
 from coopenv.estimation.poses import Array, error_dof, position_covariance, roll_pitch_yaw_deg, skew
+from coopenv.report.notebook import facts_html, one_line, picture_html
+from coopenv.report.table import Table
+from coopenv.report.tabular import Tabular
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -103,7 +105,7 @@ class Trajectory(RecordedGeometry, Tabular):
         """Degrees of freedom of `nees`: 6, or 3 where no error leaves a plane, as of robots with planar estimates."""
         return error_dof(self.rotation, self.position, self.rotation_estimate, self.position_estimate)
 
-    def columns(self) -> Columns:
+    def columns(self) -> Table:
         """Return a row per tick and vehicle; `_std_` are of the position in the map frame, from P to first order."""
         P = position_covariance(self.rotation_estimate, self.position_estimate, self.covariance)
         std, N = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1)), len(self.vehicles)
@@ -125,7 +127,7 @@ class Trajectory(RecordedGeometry, Tabular):
         values = {"t_s": np.repeat(self.t, N), "vehicle": np.tile(self.vehicles, len(self.t))}
         for names, array in parts.items():
             values |= dict(zip(names.split(), array.reshape(len(self.t) * N, -1).T, strict=True))
-        return Columns(values, ("t_s", "vehicle"))
+        return Table.of_data(values, ("t_s", "vehicle"))
 
     def __getitem__(self, vehicle: str) -> Self:
         """Return the record of one vehicle. Raises CoopenvError: there is none of that name."""

@@ -13,17 +13,19 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
 
-from coopenv.base.columns import WIDTH, Columns, Tabular, one_line, picture_html, terminal_html
 from coopenv.base.errors import CoopenvError, DataError, checked_seed, explained, listed
 from coopenv.base.files import new_folder, replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import install_command
-from coopenv.base.terminal import Terminal, text_of
 from coopenv.estimation.metrics import shown_note, shown_vehicles, steady_start
 from coopenv.estimation.observability import Observability, Trajectory, analyse_observability
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import states_covariance, with_observer
 from coopenv.policies import Policy
+from coopenv.report.notebook import WIDTH, one_line, picture_html, terminal_html
+from coopenv.report.table import Table
+from coopenv.report.tabular import Tabular
+from coopenv.report.terminal import Terminal, text_of
 from coopenv.runs import console as lines
 from coopenv.runs.bundle import RECORD_FILE, RunRecord
 from coopenv.runs.console import Progress, compile_notice
@@ -314,7 +316,7 @@ class Results(Tabular):
         """Return the trajectory of one vehicle."""
         return self.trajectory[vehicle]
 
-    def columns(self) -> Columns:
+    def columns(self) -> Table:
         """Return the trajectory, a row per tick and vehicle."""
         return self.trajectory.columns()
 
@@ -339,7 +341,7 @@ class Results(Tabular):
             yield ""
         shown, end = shown_vehicles(self.trajectory, self.steady_from, self.ends), float(self.trajectory.t[-1])
         vehicles = [self.metrics["vehicles"][i] for i in shown]
-        yield lines.metrics_table(vehicles)
+        yield Table.of(lines.COLUMNS, vehicles, folds=True)
         if note := shown_note(len(self.trajectory.vehicles)):
             yield f"{note}; all of them: {METRICS_FILE}"
         yield ""

@@ -11,16 +11,13 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Self
 
-import numpy as np
-from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
-from rich.table import Table
 
-from coopenv.base.format import column, number, seconds
-from coopenv.base.terminal import NumberTable
+from coopenv.base.format import column, seconds, three_digits
 from coopenv.estimation.metrics import CONVERGED, SETTLED
+from coopenv.report.table import Column, Table
 from coopenv.world import launch
 from coopenv.world.launch import start_warp
 
@@ -158,28 +155,42 @@ def _compiled_functions() -> int:
     return len(getattr(sys.modules.get("coopenv.estimation.compiled"), "fresh", ()))
 
 
+VEHICLE = Column("vehicle", "\nvehicle", number=False)
 COLUMNS = (
-    ("initial_position_error_m", "start\n[m]", column),
-    ("initial_orientation_error_deg", "\n[deg]", column),
-    ("settle_time_s", "settles\n[s]", seconds),
-    ("convergence_time_s", "converges\n[s]", seconds),
-    ("steady_position_rmse_m", "RMSE\n[m]", column),
-    ("steady_orientation_rmse_deg", "\n[deg]", column),
-    ("mean_targets_in_view", "targets\nseen", column),
-    ("mean_nees", "mean\nNEES", column),
+    VEHICLE,
+    Column("initial_position_error_m", "start", "m", column),
+    Column("initial_orientation_error_deg", "", "deg", column),
+    Column("settle_time_s", "settles", "s", seconds),
+    Column("convergence_time_s", "converges", "s", seconds),
+    Column("steady_position_rmse_m", "RMSE", "m", column),
+    Column("steady_orientation_rmse_deg", "", "deg", column),
+    Column("mean_targets_in_view", "targets\nseen", write=column),
+    Column("mean_nees", "mean\nNEES", write=column),
 )
-"""Key of a vehicle's metrics, heading, and how a column of them is written."""
+"""Of metrics of vehicles: errors at the start, times, errors in the steady state, targets, NEES."""
 
-RATE_COLUMNS = {
-    "rate_per_s": "fitted\n[1/s]",
-    "slowest_rate_per_s": "slowest 5 s\n[1/s]",
-    "slowest_rate_from_s": "from\n[s]",
-    "guaranteed_rate_per_s": "guaranteed\n[1/s]",
-    "guaranteed_rate_at_s": "at\n[s]",
-    "frozen_rate_window_per_s": "frozen, 5 s\n[1/s]",
-    "frozen_rate_window_from_s": "from\n[s]",
-}
-"""Key of a vehicle's metrics and heading."""
+ESTIMATES = (
+    VEHICLE,
+    Column("x", "ends at x", "m", column),
+    Column("y", "y", "m", column),
+    Column("final_yaw_estimate_deg", "yaw", "deg", column),
+    Column("position_std_m", "std", "m", column),
+    Column("orientation_std_deg", "", "deg", column),
+    Column("mean_targets_in_view", "targets\nseen", write=column),
+)
+"""Of vehicles without true poses: last estimate, standard deviations, targets."""
+
+RATES = (
+    Column("vehicle", "rate\nvehicle", number=False),
+    Column("rate_per_s", "fitted", "1/s", three_digits),
+    Column("slowest_rate_per_s", "slowest 5 s", "1/s", three_digits),
+    Column("slowest_rate_from_s", "from", "s", three_digits),
+    Column("guaranteed_rate_per_s", "guaranteed", "1/s", three_digits),
+    Column("guaranteed_rate_at_s", "at", "s", three_digits),
+    Column("frozen_rate_window_per_s", "frozen, 5 s", "1/s", three_digits),
+    Column("frozen_rate_window_from_s", "from", "s", three_digits),
+)
+"""Of metrics of vehicles: measured rates beside those of the theory."""
 
 VERDICTS = {
     "not_observable_s": "not observable",
@@ -187,46 +198,18 @@ VERDICTS = {
 }
 
 
-def number_table(names: Sequence[str], numbers: Sequence[str], gap: int = 1, folds: bool = False) -> Table:
-    """Return an empty table: columns of names, then of numbers, `gap` + 1 spaces between them; see `NumberTable`."""
-    table = NumberTable(box=box.HORIZONTALS, padding=(0, gap, 0, 0), pad_edge=False, show_edge=False)
-    table.folds = folds
-    for heading in names:
-        table.add_column(heading, no_wrap=True)
-    for heading in numbers:
-        table.add_column(heading, justify="right", no_wrap=True)
-    return table
-
-
-def metrics_table(vehicles: list[dict[str, Any]]) -> Table:
-    """Return one row per vehicle: initial error, times to settle and converge, steady errors, targets, NEES."""
-    table = number_table(["\nvehicle"], [heading for _, heading, _ in COLUMNS], folds=True)
-    cells = [write([vehicle[key] for vehicle in vehicles]) for key, _, write in COLUMNS]
-    for vehicle, row in zip(vehicles, zip(*cells, strict=True), strict=True):
-        table.add_row(vehicle["vehicle"], *row)
-    return table
-
-
 def estimates_table(vehicles: list[dict[str, Any]]) -> Table:
-    """Return one row per vehicle without true poses: last estimate, standard deviations, targets."""
-    headings = ("ends at x\n[m]", "y\n[m]", "yaw\n[deg]", "std\n[m]", "\n[deg]", "targets\nseen")
-    table = number_table(["\nvehicle"], headings, folds=True)
-    ends = np.array([[*row["final_position_estimate_m"][:2], row["final_yaw_estimate_deg"]] for row in vehicles])
-    keys = ("position_std_m", "orientation_std_deg", "mean_targets_in_view")
-    cells = [*map(column, ends.T), *(column([row[key] for row in vehicles]) for key in keys)]
-    for vehicle, row in zip(vehicles, zip(*cells, strict=True), strict=True):
-        table.add_row(vehicle["vehicle"], *row)
-    return table
+    """Return the table of vehicles without true poses."""
+    ends = (vehicle["final_position_estimate_m"] for vehicle in vehicles)
+    rows = [{**vehicle, "x": x, "y": y} for vehicle, (x, y, *_) in zip(vehicles, ends, strict=True)]
+    return Table.of(ESTIMATES, rows, folds=True)
 
 
 def rates(vehicles: list[dict[str, Any]]) -> Iterator[Table | str]:
     """Yield the measured rates beside the theory's, and their meaning; nothing without a theory."""
     if all(math.isnan(vehicle["guaranteed_rate_per_s"]) for vehicle in vehicles):
         return
-    table = number_table(["rate\nvehicle"], [*RATE_COLUMNS.values()], folds=True)
-    for vehicle in vehicles:
-        table.add_row(vehicle["vehicle"], *(number(vehicle[key], 3) for key in RATE_COLUMNS))
-    yield table
+    yield Table.of(RATES, vehicles, folds=True)
     yield "Guaranteed: the least of the run, in the norm of P. Frozen: k lambda_min(P M)."
     yield ""
 

@@ -7,20 +7,19 @@ from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
-from rich import box
 from rich.console import RenderableType
-from rich.table import Table
+from rich.table import Table as RichTable
 from rich.text import Text
 
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import listed
 from coopenv.base.format import number
 from coopenv.base.installation import environment_id, list_agents, list_envs
-from coopenv.base.terminal import NumberTable
 from coopenv.observers.registry import description, list_observers
 from coopenv.policies import find_agent
+from coopenv.report.table import Column, Table
 from coopenv.runs import scenario_text
-from coopenv.runs.scenario_text import Listing, settings
+from coopenv.runs.scenario_text import settings, text_table
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.scenes import scene_rows
 from coopenv.scenario.sensing import Noise
@@ -36,7 +35,7 @@ def summary(name: str, scenario: Scenario, recorded: bool = False) -> Iterator[R
         yield shorten(scenario.description, DESCRIPTION_LENGTH, placeholder=" ...")
     if recorded:
         yield "Recorded: every episode is the recording, whatever the seed and the actions."
-    table = Table.grid(padding=(0, 2))
+    table = RichTable.grid(padding=(0, 2))
     table.add_column(no_wrap=True)
     for subject, fact in facts(scenario).items():
         table.add_row(subject, fact)
@@ -197,11 +196,8 @@ DRIVEN_SECTIONS = ("dynamics", "action")
 DRAWN_SECTIONS = ("randomisation", "difficulty")
 """Sections that are shown only if they differ from the default."""
 
-VALUE_WIDTH = 17
-KEY_WIDTH, WHOLE_WIDTH = 31, 24
-"""Characters at most, of a key and of a cell that is not broken into lines."""
-WHOLE_COLUMNS = {"vehicle", "who", "time", "slice", "shape", "unit", "scale"}
-"""Columns that are not broken into lines."""
+KEY_WIDTH, VALUE_WIDTH = 31, 17
+"""Characters of a setting's key, at most, and of its value."""
 
 
 def describe_scenario(scenario: Scenario) -> Iterator[RenderableType]:
@@ -213,7 +209,7 @@ def describe_scenario(scenario: Scenario) -> Iterator[RenderableType]:
     steps = round(scenario.horizon * scenario.rates.decision)
     yield f"Horizon: {scenario.horizon:g} s, {steps} decisions of {scenario.ticks_per_decision} camera ticks each.\n"
     for listing in scenario_text.scene(scenario):
-        yield listing_table(listing)
+        yield listing
         yield ""
     yield Text("Settings (* differs from the default)\n", "bold")
     names = shown_sections(scenario)
@@ -230,7 +226,7 @@ def describe_scenario(scenario: Scenario) -> Iterator[RenderableType]:
         for name, field in layout.items()
     ]
     title = f"Observation: {layout.size} entries per vehicle, each (value - center) / scale, clipped"
-    yield listing_table(Listing(title, ("field", "slice", "shape", "unit", "scale", "meaning"), rows))
+    yield text_table(("field", "slice", "shape", "unit", "scale", "meaning"), rows, title)
 
 
 def shown_sections(scenario: Scenario) -> list[str]:
@@ -239,33 +235,19 @@ def shown_sections(scenario: Scenario) -> list[str]:
     return names + [name for name in DRAWN_SECTIONS if getattr(scenario, name) != type(getattr(scenario, name))()]
 
 
-def listing_table(listing: Listing) -> Table:
-    """Return a listing as a table."""
-    table = _table(*listing.columns, title=listing.title)
-    for name, column, *cells in zip(listing.columns, table.columns, *listing.rows, strict=True):
-        if name in WHOLE_COLUMNS:
-            column.min_width = min(WHOLE_WIDTH, max(len(line) for cell in cells for line in cell.splitlines() or [""]))
-    for row in listing.rows:
-        table.add_row(*row)
-    return table
-
-
 def section_table(name: str, part: BaseModel, key_width: int) -> Table:
     """Return one row per setting of a section: key, value, meaning with its unit."""
+    look: dict[str, Any] = {"number": False, "wraps": True}
+    columns = (
+        Column("key", f"[{name}]", width=min(key_width, KEY_WIDTH), **look),
+        Column("value", width=VALUE_WIDTH, **look),
+        Column("meaning", **look),
+    )
+    rows = [*settings(part)]
+    keys = [f"{key} *" if differs else key for key, *_, differs in rows]
+    values = {"key": keys, "value": [row[1] for row in rows], "meaning": [row[2] for row in rows]}
     doc = " ".join((type(part).__doc__ or "").split())
-    table = _table(f"[{name}]", "value", "meaning", title=doc)
-    table.columns[0].width, table.columns[1].width = min(key_width, KEY_WIDTH), VALUE_WIDTH
-    for key, value, meaning, differs in settings(part):
-        table.add_row(f"{key} *" if differs else key, value, meaning, style="bold" if differs else None)
-    return table
-
-
-def _table(*columns: str, title: str | None = None) -> Table:
-    look: dict[str, Any] = {"title_justify": "left", "title_style": "italic"}
-    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, **look)
-    for name in columns:
-        table.add_column(name, overflow="fold")
-    return table
+    return Table(columns, values, title=doc, strong=[i for i, row in enumerate(rows) if row[3]])
 
 
 COLUMNS = {
@@ -315,19 +297,9 @@ def _sentence(text: str) -> str:
 
 def list_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Table:
     """Return one row per entry; texts of the last column that do not fit into the width are wrapped."""
-    table = NumberTable(box=box.HORIZONTALS, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
+    shown = []
     for key in columns:
-        heading = key.removesuffix("_s") + (" [s]" if key.endswith("_s") else "")
-        number = bool(rows) and isinstance(rows[0][key], int | float)
-        whole = 0 if key == columns[-1] else max((len(cell_text(row[key])) for row in rows), default=0)
-        table.add_column(heading, justify="right" if number else "left", no_wrap=whole > 0, min_width=whole)
-    for row in rows:
-        table.add_row(*(cell_text(row[key]) for key in columns))
-    return table
-
-
-def cell_text(value: Any) -> str:
-    """Return a value of a row."""
-    if isinstance(value, list):
-        return ", ".join(value)
-    return f"{value:g}" if isinstance(value, float) else str(value)
+        title = key.removesuffix("_s") + (" [s]" if key.endswith("_s") else "")
+        last, number = key == columns[-1], bool(rows) and isinstance(rows[0][key], int | float)
+        shown.append(Column(key, title, number=number, wraps=last))
+    return Table.of(shown, rows)

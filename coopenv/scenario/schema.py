@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from coopenv.base.columns import facts_html, one_line, picture_html
 from coopenv.base.errors import ScenarioError, ScenarioWarning, check_one_of, listed, shown, suggest
 from coopenv.base.installation import load_reference
 from coopenv.base.sections import Positive, Section, Text, Vector3, overlaid, validated
 from coopenv.base.units import EPISODE, PLACE, TIME, warn_of_implausible
+from coopenv.report.notebook import facts_html, one_line, picture_html
 from coopenv.scenario.bodies import MOST_LANDMARKS, Landmark, LandmarkGroup, Obstacle, Road, Vehicle
 from coopenv.scenario.cosimulators import COSIMULATORS, Cosimulator, Highway, Program, Sumo
 from coopenv.scenario.learning import Action, Difficulty, Dynamics, Observation, Randomisation, Reward, Termination

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 import pytest
+from coopenv.bench.pages import DRIVERS, measured_drivers
 from numpy.testing import assert_allclose
 
 import coopenv
 from coopenv.api.arguments import FIELDS, OTHERS, Step, check_function
 from coopenv.base.errors import CoopenvError
-from coopenv.bench.pages import DRIVERS, measured_drivers
 from coopenv.policies import load_agent
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.policies.scripted import Peek

@@ -9,10 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
-
-from coopenv.base.installation import list_envs
-from coopenv.bench.cards import OVERVIEW
 from coopenv.bench.pages import (
     DRIVERS,
     SETTINGS,
@@ -23,6 +19,10 @@ from coopenv.bench.pages import (
     studied,
     value_of_sensing_text,
 )
+from PIL import Image
+
+from coopenv.base.installation import list_envs
+from coopenv.bench.cards import OVERVIEW
 from coopenv.cli.app import main
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.viz.topview_ground import HEIGHT, WIDTH

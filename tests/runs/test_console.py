@@ -19,12 +19,13 @@ from rich.console import Console
 import coopenv
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.installation import data_directory
-from coopenv.base.terminal import Terminal, text_of
 from coopenv.cli.app import main
 from coopenv.estimation import compiled
+from coopenv.report.table import Table
+from coopenv.report.terminal import Terminal, text_of
 from coopenv.runs import console as module
 from coopenv.runs import scenario_text as words
-from coopenv.runs.console import Progress, compile_notice, note_overwritten, number_table
+from coopenv.runs.console import Progress, compile_notice, note_overwritten
 from coopenv.runs.scenario_text import IMAGE_FIELDS, settings
 from coopenv.runs.summary import describe_scenario
 from coopenv.scenario import parse_scenario
@@ -411,8 +412,8 @@ def test_what_is_drawn_is_described() -> None:
 
 
 def test_columns_that_do_not_fit_stand_in_a_further_table() -> None:
-    table = number_table(["\nvehicle"], ["start\n[m]", "\n[deg]", "RMSE\n[m]"], folds=True)
-    table.add_row("vehicle_1", "0.1", "4", "0.2")
+    table = Table.of_texts(["\nvehicle"], ["start\n[m]", "\n[deg]", "RMSE\n[m]"], folds=True)
+    table.add("vehicle_1", "0.1", "4", "0.2")
     headings = ["start", "vehicle [m] [deg]", "vehicle_1 0.1 4", "RMSE", "vehicle [m]", "vehicle_1 0.2"]
     folded = [" ".join(line.split()) for line in text_of(table, 25).splitlines() if "─" not in line]
     assert folded == headings

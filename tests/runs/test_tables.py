@@ -15,11 +15,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import coopenv
-from coopenv.base.columns import Columns
 from coopenv.base.installation import load_reference
 from coopenv.bench.cards import KINDS
 from coopenv.cli.app import main
 from coopenv.estimation.observability import Trajectory
+from coopenv.report.table import Table
 from coopenv.runs.command import Results
 from tests.helpers.four_way import FOUR_WAY
 
@@ -148,7 +148,7 @@ def test_a_missing_package_is_one_line(results: Results, tmp_path: Path, monkeyp
 
 
 def test_columns_are_in_the_order_of_the_rows() -> None:
-    table = Columns({"name": ["b", "a"], "way_m": np.array([1.0, np.inf]), "count": [1, 2]}, ("name",))
+    table = Table.of_data({"name": ["b", "a"], "way_m": np.array([1.0, np.inf]), "count": [1, 2]}, ("name",))
     assert table.csv() == "name,way_m,count\nb,1.0,1\na,,2\n"
     assert table.units == {"way_m": "m", "count": "1"}
 

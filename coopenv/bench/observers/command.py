@@ -14,7 +14,6 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from coopenv.base.columns import Columns
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text, replacing_folder
 from coopenv.base.format import json_text, jsonable, with_error
@@ -26,7 +25,6 @@ from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.figures import KINDS, PLOTLY, basin_figure, chart_data, packed, page_file, stanford_figure
 from coopenv.bench.observers.rows import BOUNDS, Leaderboard, Row, spread
 from coopenv.bench.observers.tables import (
-    environment,
     failures,
     headline,
     honest_line,
@@ -34,6 +32,8 @@ from coopenv.bench.observers.tables import (
     quality,
 )
 from coopenv.estimation.metrics import CONVERGED
+from coopenv.report.table import Table
+from coopenv.report.templates import templates
 from coopenv.runs.console import Progress, note_overwritten
 from coopenv.viz import FORMATS
 
@@ -129,7 +129,7 @@ def write_files(
     """Write the leaderboard as JSON and CSV, the draws as CSV, the report, and figures by name, kind and variant."""
     content = document(board, command)
     texts = {JSON_FILE: json_text(content), CSV_FILE: board.to_csv(), WINDOWS_FILE: board.to_csv(windows=True)}
-    texts |= {BASIN_FILE: Columns.of_rows(board.draws).csv()} if board.draws else {}
+    texts |= {BASIN_FILE: Table.of_rows(board.draws).csv()} if board.draws else {}
     texts |= {LATEX_FILE: board.to_latex(), REPORT_FILE: report_text(board, content)}
     for name, text in texts.items():
         replace_text(out / name, text)
@@ -167,7 +167,7 @@ def report_text(board: Leaderboard, content: Mapping[str, Any]) -> str:
         "columns": [f.name for f in fields(Row) if f.name not in ("environment", "failure")],
         "definitions": {f.name: f.metadata["meaning"] for f in fields(Row)},
     }
-    texts = environment(autoescape=True)
+    texts = templates("coopenv.bench.observers", "page", autoescape=True)
     texts.globals |= {"with_error": with_error, "spread": spread, "tint": _tints(board), "nan": math.nan}
     texts.globals["breakable"] = lambda name: Markup("<wbr>").join(re.split(r"(?<=_)", name))
     texts.filters["append"] = lambda text, more: text + more

@@ -10,12 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
-from rich.table import Table
 
-from coopenv.base.columns import Columns, Tabular, one_line, picture_html, terminal_html, written
 from coopenv.base.errors import CoopenvError, DataWarning, check_one_of, checked_seed, explained
 from coopenv.base.installation import names_of
-from coopenv.base.terminal import Terminal, text_of
 from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables
 from coopenv.bench.observers.judge import JudgedRun, Task, judge_all
@@ -23,6 +20,10 @@ from coopenv.bench.observers.rows import EDGES, Leaderboard, checked_edges
 from coopenv.bench.observers.sources import ALL, RecordSource, find_source, variants_of
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import available_names, find, list_observers, named, obstacle, portable
+from coopenv.report.notebook import one_line, picture_html, terminal_html
+from coopenv.report.table import Table
+from coopenv.report.tabular import Tabular, written
+from coopenv.report.terminal import Terminal, text_of
 from coopenv.runs.console import Progress
 from coopenv.scenario import ScenarioLike
 from coopenv.sources.selection import Selection
@@ -59,10 +60,10 @@ class Comparison(Leaderboard, Tabular):
         """
         return tables.error_table(self, self._checked(variant))
 
-    def columns(self, windows: bool = False) -> Columns:
+    def columns(self, windows: bool = False) -> Table:
         """Return the rows with all columns, of whole runs or of every window of time."""
         keys = ("variant", "observer", *(("window",) if windows else ()), "vehicle")
-        return Columns.of_rows(self.window_rows if windows else self.rows, *keys)
+        return Table.of_rows(self.window_rows if windows else self.rows, *keys)
 
     def __getitem__(self, observer: str) -> Comparison:
         """Return the results of one observer alone.

@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from coopenv.api.engine import Engine
@@ -25,7 +24,7 @@ from coopenv.observers.contract import Factory
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import portable
 from coopenv.observers.runner import run
-from coopenv.runs.console import number_table
+from coopenv.report.table import Table
 from coopenv.scenario import Scenario
 
 RADIUS = 15.0  # m
@@ -161,10 +160,10 @@ def basins_of(environment: str, draws: Sequence[Draw]) -> list[Basin]:
 def basin_table(basins: Sequence[Basin]) -> Table:
     """Return the number of draws that converge, one line per observer."""
     numbers = ["draws", "failed", "all vehicles\nconverge", "95 %", "converged [s]\nmedian"]
-    table = number_table(["basin"], numbers, gap=0)
+    table = Table.of_texts(["basin"], numbers, gap=0)
     for basin in basins:
         low, high = (100 * end for end in basin.interval)
-        table.add_row(
+        table.add(
             basin.observer,
             str(basin.draws),
             str(basin.failed),
@@ -251,11 +250,11 @@ def study_seeds(
 def seed_table(study: SeedStudy) -> Table:
     """Return one row per vehicle: settled seeds, settling time, steady RMSE as mean, spread and worst."""
     rmse = ("position RMSE [m]\nmean±std (worst)", "orientation [deg]\nmean±std (worst)")
-    table = number_table(("vehicle",), ("settled\nseeds", "settles at [s]\nmedian (last)", *rmse))
+    table = Table.of_texts(("vehicle",), ("settled\nseeds", "settles at [s]\nmedian (last)", *rmse))
     for i, vehicle in enumerate(study.vehicles):
         times = study.settle_time_s[:, i]
         settled = times[np.isfinite(times)]
-        table.add_row(
+        table.add(
             vehicle,
             f"{len(settled)}/{len(times)}",
             f"{np.median(settled):.1f} ({settled.max():.1f})" if len(settled) else "-",

@@ -5,8 +5,6 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from rich.table import Table
 
 from coopenv.base.format import in_parentheses, number, with_error
 from coopenv.bench.observers.convergence import basin_failures, basin_table
@@ -25,7 +23,7 @@ from coopenv.bench.observers.rows import (
 )
 from coopenv.estimation.metrics import SETTLED, mean_or_nan
 from coopenv.estimation.poses import Array
-from coopenv.runs.console import number_table
+from coopenv.report.table import Table
 
 FAILED = "failed"
 
@@ -128,7 +126,7 @@ def everything(board: Leaderboard, width: int = WIDTH) -> Iterator[Table | str]:
         yield consistency_table(board, variant)
         if line := honest_line(board.rows):
             yield line
-        if (levels := level_table(board, variant)).row_count:
+        if levels := level_table(board, variant):
             yield ""
             yield levels
         yield from window_tables(board, variant, width)
@@ -162,7 +160,7 @@ def _add_observers(
         for n, window in enumerate(windows):
             found = cells(own if window is None else board.windows_in(variant, name, window))
             shown = [FAILED] * len(found) if any(row.failure for row in own) else found
-            table.add_row(short_name(name) if n == 0 else "", *([window.name] if window else []), *shown)
+            table.add(short_name(name) if n == 0 else "", *([window.name] if window else []), *shown)
     return table
 
 
@@ -181,11 +179,11 @@ def _headings(board: Leaderboard) -> list[str]:
 def error_table(board: Leaderboard, variant: str) -> Table:
     """Return position RMSE in m of one variant per vehicle, and their mean, the bounds first."""
     few = len(board.vehicles) <= MOST_COLUMNS
-    table = number_table(["position RMSE [m]"], [*_headings(board), "mean"] if few else ["mean", "worst"], gap=0)
+    table = Table.of_texts(["position RMSE [m]"], [*_headings(board), "mean"] if few else ["mean", "worst"], gap=0)
     for column, values in board.bounds_in(variant).items():
         average = sum(values) / len(values)
         shown = [*values, average] if few else [average, max(values)]
-        table.add_row(BOUNDS[column], *(number(value, 3) for value in shown))
+        table.add(BOUNDS[column], *(number(value, 3) for value in shown))
 
     def cells(own: list[Row]) -> list[str]:
         mean, found = in_parentheses(*board.totals[variant, own[0].observer].rmse), _cells(own, "position_rmse_m", few)
@@ -203,7 +201,7 @@ def ratio_table(board: Leaderboard, variant: str) -> Table:
         mean = [] if few else [number(mean_of(own, column), 3)]
         return [*mean, *_cells(own, column, few), *_cells(own, "ratio_to_bound", False)]
 
-    return _add_observers(number_table(["RMSE / bound\n(ancestors)"], headings, gap=0), board, variant, cells)
+    return _add_observers(Table.of_texts(["RMSE / bound\n(ancestors)"], headings, gap=0), board, variant, cells)
 
 
 def honest_line(rows: Sequence[Row]) -> str:
@@ -224,7 +222,7 @@ def quality_table(board: Leaderboard, variant: str) -> Table:
             *(f"{mean_of(own, column):.0f}" for column in ("bytes_per_s", "us_per_update")),
         ]
 
-    return _add_observers(number_table(["observer"], headings, gap=0), board, variant, cells)
+    return _add_observers(Table.of_texts(["observer"], headings, gap=0), board, variant, cells)
 
 
 def largest_error(rows: Sequence[Row]) -> float:
@@ -245,7 +243,7 @@ def consistency_table(board: Leaderboard, variant: str) -> Table:
         innovations = number(float(np.mean(nis)), 2) if nis else "-"
         return [verdict_on(own).replace(" ", "\n"), lowest, *highest, innovations, finding]
 
-    return _add_observers(number_table(["consistency"], headings, gap=0), board, variant, cells)
+    return _add_observers(Table.of_texts(["consistency"], headings, gap=0), board, variant, cells)
 
 
 def _short(vehicle: str) -> str:
@@ -275,9 +273,9 @@ def level_figures(board: Leaderboard, variant: str) -> dict[str, list[Measured]]
 
 def level_table(board: Leaderboard, variant: str) -> Table:
     """Return, of one variant over all vehicles, how protection levels compare with errors; empty: none are stated."""
-    table = number_table(["protection level"], [*LEVELS.values()], gap=0)
+    table = Table.of_texts(["protection level"], [*LEVELS.values()], gap=0)
     for name, measured in level_figures(board, variant).items():
-        table.add_row(short_name(name), *(compact(*one) if one.value else "0" for one in measured))
+        table.add(short_name(name), *(compact(*one) if one.value else "0" for one in measured))
     return table
 
 
@@ -311,7 +309,7 @@ def by_vehicle(board: Leaderboard, variant: str, heading: str, column: str) -> T
     def cells(rows: list[WindowRow]) -> list[str]:
         return [compact(getattr(row, column), getattr(row, ERRORS[column])) for row in rows]
 
-    table = number_table([heading, "window"], _headings(board), gap=0)
+    table = Table.of_texts([heading, "window"], _headings(board), gap=0)
     return _add_observers(table, board, variant, cells, board.windows)
 
 
@@ -326,7 +324,7 @@ def summary(board: Leaderboard, variant: str) -> Table:
             *_spread(rows, "anees", 2),
         ]
 
-    table = number_table(["by window", "window"], headings, gap=0)
+    table = Table.of_texts(["by window", "window"], headings, gap=0)
     return _add_observers(table, board, variant, cells, board.windows)
 
 
@@ -338,12 +336,12 @@ def _spread(rows: Sequence[WindowRow], column: str, digits: int) -> list[str]:
 
 def variant_table(board: Leaderboard, heading: str, column: str, variants: Sequence[str]) -> Table:
     """Return a column of the totals, over all vehicles, of every observer in some variants."""
-    table = number_table([heading], ["\n".join(name.replace("+", "_+").split("_")) for name in variants], gap=0)
+    table = Table.of_texts([heading], ["\n".join(name.replace("+", "_+").split("_")) for name in variants], gap=0)
     for name in board.ranked:
         measured = [getattr(board.totals[variant, name], column) for variant in variants]
         failed = [column == "rmse" and np.isnan(one.value) for one in measured]
         cells = [FAILED if bad else in_parentheses(*one) for bad, one in zip(failed, measured, strict=True)]
-        table.add_row(short_name(name), *cells)
+        table.add(short_name(name), *cells)
     return table
 
 
@@ -361,28 +359,20 @@ def latex(board: Leaderboard, variant: str) -> str:
 
     Five vehicles fit a column of 3.5 in.
     """
-    texts = environment(trim_blocks=True, keep_trailing_newline=True)
-    texts.filters["cell"] = lambda r: FAILED if r.failure else compact(r.position_rmse_m, r.position_rmse_se_m)
-    texts.filters["judged"] = _judged
-    texts.globals["stacked"] = _latex_name
-    bounds = {BOUNDS[c]: [number(v, 3) for v in values] for c, values in board.bounds_in(variant).items()}
-    values = {"board": board, "variant": variant, "headings": _headings(board), "bounds": bounds}
-    return texts.get_template("leaderboard.tex.j2").render(values)
-
-
-def environment(**options: Any) -> Environment:
-    """Return the renderer of the templates beside the report's."""
-    loader = PackageLoader("coopenv.bench.observers", "page")
-    return Environment(loader=loader, undefined=StrictUndefined, **options)
-
-
-def _judged(rows: Sequence[Row]) -> str:
-    """Return the largest error after the start and the verdict of an observer, in words."""
-    failed = any(row.failure for row in rows)
-    return FAILED if failed else f"{number(largest_error(rows), 2)} m, {verdict_on(rows)}"
-
-
-def _latex_name(name: str) -> str:
-    """Return an observer's name, stacked where it is long; LaTeX's special characters stand for themselves."""
-    stacked = re.sub(r"([&%$#_{}])", r"\\\1", short_name(name).replace("\\", "/")).replace("\n", r"\\")
-    return rf"\shortstack[l]{{{stacked}}}" if r"\\" in stacked else stacked
+    table = Table.of_texts([""], _headings(board))
+    for column, values in board.bounds_in(variant).items():
+        table.add(BOUNDS[column], *(number(value, 3) for value in values))
+    table.rules.append(len(table))
+    rows = {name: board.rows_in(variant, name) for name in board.ranked}
+    for name, own in rows.items():
+        cells = (FAILED if row.failure else compact(row.position_rmse_m, row.position_rmse_se_m) for row in own)
+        table.add(short_name(name), *cells)
+    table.rules.append(len(table))
+    table.add("worst after start", "verdict")
+    for name, own in rows.items():
+        failed = any(row.failure for row in own)
+        table.add(short_name(name), FAILED if failed else f"{number(largest_error(own), 2)} m, {verdict_on(own)}")
+    return table.latex(
+        f"{board.title}, {variant}: position RMSE in m",
+        f"0.0123(4) is 0.0123 with a standard error of 0.0004 over the {board.sampled}. Needs booktabs.",
+    )

@@ -97,7 +97,7 @@ def _print_topics(rows: Sequence[TopicRow], as_json: bool) -> None:
         options.print_json([*rows])
         return
     from coopenv.cars.bags.clocks import written
-    from coopenv.runs.console import number_table
+    from coopenv.report.table import Table
 
     read = any(row.role for row in rows)
     names = ["topic", "read as" if read else "type"]
@@ -108,7 +108,7 @@ def _print_topics(rows: Sequence[TopicRow], as_json: bool) -> None:
         *("bad\nstamps", "longest\ngap [s]", "gaps", "clock\n[ms]"),
         *(["leads\n[ms]"] if read else []),
     ]
-    table = number_table(names, numbers)
+    table = Table.of_texts(names, numbers)
     for row in rows:
         about = (f"{row.car} {row.role}" if row.role else "") if read else row.type
         offset = None if row.offset is None else 1e3 * row.offset
@@ -116,7 +116,7 @@ def _print_topics(rows: Sequence[TopicRow], as_json: bool) -> None:
         figures = [(row.rate, 1), *used, (row.outlying, 0), (row.gap, 3), (row.gaps, 0), (offset, 1)]
         shown = ("-" if value is None else f"{value:.{digits}f}" for value, digits in figures)
         lead = "-" if row.lead is None or row.lead_error is None else written(row.lead, row.lead_error)
-        table.add_row(row.topic, about, str(row.messages), *shown, *([lead] if read else []))
+        table.add(row.topic, about, str(row.messages), *shown, *([lead] if read else []))
     options.console().print(table)
 
 
@@ -192,7 +192,8 @@ def identify(
     from coopenv.cars.bags.bag import open_bags
     from coopenv.cars.identify import identify as identified
     from coopenv.cars.identify import toml_text
-    from coopenv.runs.console import Progress, number_table
+    from coopenv.report.table import Table
+    from coopenv.runs.console import Progress
 
     check_file(out)
     bag = open_bags(bags, options.parse_overrides(overrides), topics)
@@ -203,9 +204,9 @@ def identify(
         options.print_json({"car": result.car, "rows": result.rows, "distances": result.distances})
         return
     _print(result.rows)
-    table = number_table(["quantity"], ["samples", "as given", "identified", "by chance"])
+    table = Table.of_texts(["quantity"], ["samples", "as given", "identified", "by chance"])
     for row in result.distances:
-        table.add_row(row.quantity, str(row.samples), *(f"{d:.3f}" for d in (row.given, row.identified, row.seeds)))
+        table.add(row.quantity, str(row.samples), *(f"{d:.3f}" for d in (row.given, row.identified, row.seeds)))
     console = options.console()
     console.print(table)
     console.print(f"File: {out}", soft_wrap=True)
@@ -213,9 +214,9 @@ def identify(
 
 def _print(rows: Sequence[ConstantRow]) -> None:
     """Print a table of constants."""
-    from coopenv.runs.console import number_table
+    from coopenv.report.table import Table
 
-    table = number_table(["constant", "unit", "finding"], ["given", "estimate", "std. error"])
+    table = Table.of_texts(["constant", "unit", "finding"], ["given", "estimate", "std. error"])
     for row in rows:
-        table.add_row(row.name, row.unit, row.finding, f"{row.given:.5g}", f"{row.value:.5g}", f"{row.error:.2g}")
+        table.add(row.name, row.unit, row.finding, f"{row.given:.5g}", f"{row.value:.5g}", f"{row.error:.2g}")
     options.console().print(table)

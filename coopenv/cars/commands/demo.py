@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed
 from coopenv.base.files import replacing_file, writing
@@ -24,8 +23,9 @@ from coopenv.cars.fake.lockstep import LockstepFakes
 from coopenv.cars.profile import Role
 from coopenv.cars.zenoh import library
 from coopenv.estimation.metrics import live_ticks, summarise
+from coopenv.report.table import Table
 from coopenv.runs.command import execute, report
-from coopenv.runs.console import Progress, compile_notice, number_table
+from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.rollouts import Rollout
 from coopenv.scenario import Scenario
 
@@ -60,11 +60,9 @@ def kept_drive(path: Path | None, backend: Svea) -> str:
 def links_report(backend: Svea, out: Console) -> None:
     """Print a table with a row per car, and a line on time and on why it ended."""
     health = backend.health
-    table = Table(title="Links", title_justify="left", box=None)
-    for name in ("car", "gate", "clock offset", "messages refused", "gate refused"):
-        table.add_column(name, justify="left" if name in ("car", "gate") else "right")
+    table = Table.of_texts(("car", "gate"), ("clock offset", "messages refused", "gate refused"), title="Links")
     for notes, here, there in _links(backend):
-        table.add_row(notes["name"], notes["gate"], f"{1e3 * notes['clock_offset']:.1f} ms", str(here), str(there))
+        table.add(notes["name"], notes["gate"], f"{1e3 * notes['clock_offset']:.1f} ms", str(here), str(there))
     out.print(table)
     late = 1e3 * backend.pacer.late(0.99)
     out.print(
@@ -125,12 +123,12 @@ MEANS = (("steady_position_rmse_m", 1, 4), ("steady_orientation_rmse_deg", 1, 2)
 def side_by_side(vehicles: list[str], backends: Mapping[str, list[Rows]]) -> Table:
     """Return a row per vehicle and backend, of all episodes: the last settling; means with standard errors."""
     headings = ("\nseeds", "settles\nby [s]", "RMSE [m]\nmean±SE", "RMSE [deg]\nmean±SE", "hidden [%]\nmean±SE")
-    table = number_table(("\nvehicle", "\non"), headings)
+    table = Table.of_texts(("\nvehicle", "\non"), headings)
     for i, vehicle in enumerate(vehicles):
         for name, episodes in backends.items():
             settled = float(np.max([rows[i]["settle_time_s"] for rows in episodes]))  # NaN where one never does
             means = [_mean([factor * rows[i][key] for rows in episodes], digits) for key, factor, digits in MEANS]
-            table.add_row(vehicle, name, str(len(episodes)), *seconds([settled]), *means)
+            table.add(vehicle, name, str(len(episodes)), *seconds([settled]), *means)
     return table
 
 

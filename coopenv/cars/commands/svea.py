@@ -387,7 +387,8 @@ def attack(
     from coopenv.cars.attack import Intruder, open_ports, plan, refuse_driven
     from coopenv.cars.attack import attack as attacked
     from coopenv.cars.deployment import load_deployment
-    from coopenv.runs.console import Progress, number_table
+    from coopenv.report.table import Table
+    from coopenv.runs.console import Progress
 
     fleet, log, out = load_deployment(deployment, connect), options.console(stderr=True), options.console()
     cars = [car.name for car in fleet.cars if car.landmark is None]
@@ -397,7 +398,7 @@ def attack(
         print(plan(intruder, fleet, commands), file=sys.stderr)
         if not (yes or fleet.fakes) and not (sys.stdin.isatty() and typer.confirm("Attack?", err=True)):
             raise CoopenvError("no attack on real cars without a yes (--yes)")
-        table = number_table(["\nattack"], ("\nsent", "refused\nby gate", "got\nthrough", "fastest\n[m/s]"))
+        table = Table.of_texts(["\nattack"], ("\nsent", "refused\nby gate", "got\nthrough", "fastest\n[m/s]"))
         sent, bad = 0, list[str]()
         with Progress(log, "attacks", len(intruder.kinds())) as progress:
             for found in attacked(intruder, commands):
@@ -405,10 +406,10 @@ def attack(
                 bad += [found.what] if found.harmful else []
                 speed = "?" if isnan(found.speed) else f"{found.speed:.2f}"
                 cells = found.sent, found.refused, found.through, speed
-                table.add_row(found.what, *map(str, cells))
+                table.add(found.what, *map(str, cells))
                 progress.advance()
     out.print(table)
-    out.print(f"{len(bad)} of {len(table.rows)} kinds got through, of {sent} messages: {'; '.join(bad) or 'none'}.")
+    out.print(f"{len(bad)} of {len(table)} kinds got through, of {sent} messages: {'; '.join(bad) or 'none'}.")
     if host:
         out.print(f"Open ports: {', '.join(ports) or 'none of those that should be closed'}.")
     if bad or ports:

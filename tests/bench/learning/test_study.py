@@ -8,10 +8,10 @@ from typing import Any
 from weakref import ref
 
 import pytest
+from coopenv.bench.learning import Judge, Study, place_of, read_study
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import data_directory
-from coopenv.bench.learning import Judge, Study, place_of, read_study
 from coopenv.evaluation import Difference, Episodes, Result, compare_paired, drive, score
 
 STUDY = """

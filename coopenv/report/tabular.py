@@ -1,23 +1,16 @@
-"""Results as columns with units for pandas, polars, xarray, CSV and Parquet; on one line, and as HTML for notebooks."""
+"""Results as tables for pandas, polars, xarray, CSV and Parquet."""
 
 from __future__ import annotations
 
-import csv
-import math
 from abc import ABC, abstractmethod
-from base64 import b64encode
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
-from html import escape
-from io import BytesIO, StringIO
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-import numpy as np
-
-from coopenv.base.errors import CoopenvError, Explained, shown
+from coopenv.base.errors import CoopenvError, Explained
 from coopenv.base.files import replace_text, replacing_file
 from coopenv.base.installation import install_command, needing
+from coopenv.report.table import Table
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -25,56 +18,6 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 INSTALL = install_command("tables")
-UNITS = {
-    "gramian_min_eigenvalue": "mixed",
-    "bytes_per_s": "byte/s",
-    "us_per_update": "us",
-    "_m_per_s": "m/s",
-    "_rad_per_s": "rad/s",
-    "_per_s": "1/s",
-    "_m": "m",
-    "_s": "s",
-    "_deg": "deg",
-    "_rad": "rad",
-}
-"""End of a column's name to its unit, the first that fits; of other numbers it is 1."""
-
-
-@dataclass(frozen=True)
-class Columns:
-    """A table, column by column."""
-
-    values: Mapping[str, Sequence[Any] | np.ndarray]
-    """Columns of equal length, by name."""
-    keys: tuple[str, ...]
-    """Columns whose values together name a row."""
-    mixed: tuple[str, ...] = ()
-    """Columns of numbers whose units differ from row to row."""
-
-    @classmethod
-    def of_rows(cls, rows: Sequence[Any], *keys: str) -> Columns:
-        """Return dataclasses of one kind, at least one, with a column per field."""
-        return cls({field.name: [getattr(row, field.name) for row in rows] for field in fields(rows[0])}, keys)
-
-    @property
-    def units(self) -> dict[str, str]:
-        """The unit of every column of numbers that has one."""
-        known = {name: values for name, values in self.values.items() if name not in self.mixed}
-        numbers = [name for name, values in known.items() if np.asarray(values).dtype.kind in "fiu"]
-        return {name: next((u for end, u in UNITS.items() if name.endswith(end)), "1") for name in numbers}
-
-    def csv(self) -> str:
-        """Return the table as CSV; numbers that are not finite are empty."""
-        text = StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(self.values)
-        columns = (values.tolist() if isinstance(values, np.ndarray) else values for values in self.values.values())
-        writer.writerows([_cell(value) for value in row] for row in zip(*columns, strict=True))
-        return text.getvalue()
-
-
-def _cell(value: Any) -> Any:
-    return "" if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class Tabular(Explained, ABC):
@@ -87,7 +30,7 @@ class Tabular(Explained, ABC):
     _PARTS = ""  # attribute with the names that `result[name]` takes, over which a result is iterated
 
     @abstractmethod
-    def columns(self) -> Columns:
+    def columns(self) -> Table:
         """Return the table."""
 
     def __iter__(self) -> Iterator[str]:
@@ -155,39 +98,3 @@ def written(text: str, path: str | Path | None) -> str:
     if path is not None:
         replace_text(path, text)
     return text
-
-
-WIDTH = 110
-"""Characters on a line of a notebook."""
-
-
-def one_line(kind: object, title: str, facts: Mapping[str, object]) -> str:
-    """Return the `repr` of an object: `Kind('title', fact=value, ...)`."""
-    return f"{type(kind).__name__}({', '.join([repr(title), *(f'{key}={shown(facts[key])}' for key in facts)])})"
-
-
-def facts_html(title: str, facts: Mapping[str, object]) -> str:
-    """Return a heading, and a table with a line per fact."""
-    rows = "".join(f"<tr><th>{escape(key)}</th><td>{escape(str(fact))}</td></tr>" for key, fact in facts.items())
-    return f"<b>{escape(title)}</b><table>{rows}</table>"
-
-
-def terminal_html(printable: Any) -> str:
-    """Return rich's output of an object, its alignment kept."""
-    from coopenv.base.terminal import Terminal
-
-    console = Terminal(file=StringIO(), record=True, width=WIDTH)
-    console.print(printable)
-    return console.export_html(inline_styles=True, code_format='<pre style="line-height: 1.2">{code}</pre>')
-
-
-def picture_html(picture: Any) -> str:
-    """Return a figure of Matplotlib, or pixels (H, W, 3) uint8, as a picture in the page itself."""
-    data = BytesIO()
-    if hasattr(picture, "savefig"):
-        picture.savefig(data, format="png", dpi=100)
-    else:
-        from PIL import Image
-
-        Image.fromarray(picture).save(data, "png")
-    return f'<img style="max-width: 100%" src="data:image/png;base64,{b64encode(data.getvalue()).decode()}">'
