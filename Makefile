@@ -71,7 +71,7 @@ test-train: $(VENV)/.train ## the tests that train policies (installs torch)
 	@$(BIN)/python -m pytest -m train
 
 agents: $(VENV)/.train ## train the agents of agents/ that learn, about two hours; goes on where it was interrupted
-	@$(BIN)/coopenv bench learning agents/study.toml
+	@$(BIN)/python -m benchmarks.learning agents/study.toml
 
 $(VENV)/.study: $(VENV)/.train
 	@echo "Installing the methods of the study into $(VENV) (once) ..."
@@ -148,7 +148,7 @@ schema: $(VENV)/.base ## write the JSON schema of scenario files, which editors 
 	@$(BIN)/coopenv schema --out docs/scenario.schema.json
 
 pages: $(VENV)/.base ## write the pages of the environments and the replay of the home page; MEASURE=--measure for their figures, too
-	@$(BIN)/coopenv page --all $(MEASURE) --out docs/environments
+	@$(BIN)/python -m sitegen.environments --all $(MEASURE) --out docs/environments
 	@$(BIN)/python -m sitegen.replay
 
 clean: ## remove the virtual environment and all results

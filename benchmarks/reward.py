@@ -1,7 +1,8 @@
 """Both arms of `agents/reward_study.toml` in held-out worlds: does a reward for localisation pay?
 
-`python -m benchmarks.reward FOLDER`, after `coopenv bench learning agents/reward_study.toml --out FOLDER`, prints the
-figures of every seed, the means over seeds and their difference, with 95 % intervals (bootstrap over seeds and worlds).
+After `python -m benchmarks.learning agents/reward_study.toml --out FOLDER`, `python -m benchmarks.reward FOLDER` prints
+the figures of every seed, the means over seeds and their difference, with 95 % intervals (bootstrap over seeds and
+worlds).
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "coopenv"
 
 ROOMS = (
     ("base",),
+    ("report",),
     ("scenario",),
     ("estimation",),
     ("world",),

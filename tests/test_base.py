@@ -28,7 +28,6 @@ from coopenv.base.format import (
     seconds,
     with_error,
 )
-from coopenv.report.terminal import NumberTable, text_of
 
 
 class Unspeakable:
@@ -268,11 +267,3 @@ def test_arrays_that_python_would_unpack_without_a_limit_are_refused(tmp_path: P
             archive.writestr("nees.npy", content)
         with pytest.raises(DataError, match=r"made\.npz: a part is in it twice, or packed by neither of: stored"):
             read_npz(path, "record", wanted)
-
-
-def test_a_terminal_shows_control_characters_and_does_not_obey_them() -> None:
-    table = NumberTable("a\x1b]0;b")
-    table.add_row("c\x1b[2J\x9b\nd")
-    shown = text_of(table, 80)
-    assert r"a\x1b]0;b" in shown and r"c\x1b[2J\x9b" in shown and "\x1b" not in shown and "\x9b" not in shown
-    assert text_of("one\n\ttwo \x07", 80) == "one\n        two \\x07\n"

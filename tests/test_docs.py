@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
-from coopenv.bench.learning import read_study
 
 import coopenv
+from benchmarks.learning.study import read_study
 from coopenv.api.arguments import FIELDS, OTHERS, Step
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import CoopenvError

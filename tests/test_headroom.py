@@ -10,16 +10,17 @@ from functools import cache
 
 import numpy as np
 import pytest
-from coopenv.bench.pages import cooperation_settings
 
 import coopenv
 from coopenv.api.engine import Engine
-from coopenv.bench.cards import Contest
+from coopenv.bench.contest import Contest
+from coopenv.bench.evaluation import evaluated
 from coopenv.evaluation import Difference, Episodes, compare_paired, drive, held_out_seeds, ranking_key, score
 from coopenv.evaluation.metrics import scored_errors
 from coopenv.policies import load_agent
 from coopenv.scenario import load_scenario
 from coopenv.scenario.learning import Difficulty
+from sitegen.environments.sensing import cooperation_settings
 from tests.helpers.env_suite import LARGEST, rest_slow
 
 pytestmark = pytest.mark.headroom
@@ -173,7 +174,7 @@ LEAST_IF_ONE_LIES = 0.8
 @pytest.mark.parametrize(("agent", "environment"), LEAST)
 def test_learned_agents_arrive_whatever_they_sense(agent: str, environment: str) -> None:
     contest = Contest.of(environment, {}, [agent], 64, 9, stressed=True)
-    found = {name: {r.metric: r.mean for r in results} for name, results in contest.drive().results.items()}
+    found = {name: {r.metric: r.mean for r in results} for name, results in evaluated(contest).results.items()}
     arrived = {name: rates["arrival_rate"] for name, rates in found.items()}
     hard = ("initial error x 3", "in one corner", "as far out")
     hardest = [arrived.pop(name) for name in [*arrived] if name.endswith(hard)]

@@ -75,9 +75,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ([*WATCH, "route_follower", "--out", "file"], "cannot write to file: it is not a folder"),
         (["watch", "route_follower", "--speed", "nan"], "Invalid value for '--speed'"),
         (["play", "facade", "--others", "nobody"], "unknown policy 'nobody'"),
-        (["page", "facade", "--out", "file"], "cannot write to file"),
-        (["page", "facade", "busy_intersection", "--measure"], "there is nothing to drive"),
-        (["page", "raises.py"], "unknown environment 'raises.py'"),
         (["run", "facade", "--set", "seed=3"], "seed: unknown key; allowed: action, backend,"),
         (["bench", "observers", "overtaking", "--observers", ""], "unknown observer ''; known: "),
         (["bench", "observers", "overtaking", "--seeds", "1000", "--out", "file"], "cannot write to file"),
@@ -143,7 +140,7 @@ def test_one_line_and_nothing_is_left(
 
 
 @pytest.mark.skipif(not os.path.ismount("/proc"), reason="needs a folder that nobody can write to")
-@pytest.mark.parametrize("arguments", [[*EVALUATE, "peek"], [*WATCH, "peek"], ["page", "facade"]])
+@pytest.mark.parametrize("arguments", [[*EVALUATE, "peek"], [*WATCH, "peek"]])
 def test_a_folder_that_cannot_be_made(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*arguments, "--out", "/proc/nobody"]) == 2
     assert "error: cannot write to /proc/nobody" in capsys.readouterr().err

@@ -104,7 +104,6 @@ WRONG = {
     "bench observers facade --observers nosuch.py:Mine": set(),
     "bench observers nosuch.bag": {"numpy"},
     "bench v1 examples/own_observer.py:Eky": set(),
-    "bench learning nosuch.toml": {"numpy"},
     "evaluate facade --agents nosuch.py:Mine": set(),
     "train facade --set nosuch=3": set(),
     "train facade --agent nosuch": set(),

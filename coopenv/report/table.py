@@ -152,9 +152,31 @@ class Table:
         return {name: next((u for end, u in UNITS.items() if name.endswith(end)), "1") for name in numbers}
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        from coopenv.report.terminal import on_terminal
+        from rich import box
+        from rich.table import Table as RichTable
 
-        yield on_terminal(self)
+        from coopenv.report.terminal import NumberTable
+
+        look: dict[str, Any] = {"padding": (0, self.gap, 0, 0), "show_edge": False}
+        if self.title is None:
+            drawn: RichTable = NumberTable(self.folds, box=box.HORIZONTALS, pad_edge=False, **look)
+        else:
+            look |= {"title_justify": "left", "title_style": "italic"}
+            drawn = RichTable(title=self.title, box=box.SIMPLE_HEAD, **look)
+        wrapped = any(column.wraps for column in self.columns)
+        for column, cells in zip(self.columns, self.cells, strict=True):
+            whole = max(map(len, cells), default=0) if wrapped and not column.wraps else None
+            drawn.add_column(
+                column.heading,
+                justify="right" if column.number else "left",
+                no_wrap=not column.wraps,
+                overflow="ellipsis" if self.title is None else "fold",
+                width=column.width,
+                min_width=column.least or whole,
+            )
+        for i, row in enumerate(zip(*self.cells, strict=True)):
+            drawn.add_row(*row, style="bold" if i in self.strong else None)
+        yield drawn
 
     def csv(self) -> str:
         """Return the values as CSV; numbers that are not finite are empty."""

@@ -7,14 +7,11 @@ from dataclasses import replace
 from io import StringIO
 from typing import Any
 
-from rich import box
 from rich.console import Console, ConsoleOptions, RenderResult
-from rich.table import Column
-from rich.table import Table as RichTable
+from rich.table import Column, Table
 from rich.text import Text
 
 from coopenv.base.errors import printable
-from coopenv.report.table import Table
 
 NARROWEST = 20  # columns; a terminal that states fewer has 80
 PLAIN: dict[str, Any] = {"markup": False, "highlight": False, "emoji": False}
@@ -40,7 +37,7 @@ class Terminal(Console):
 CONTINUED = ("\n", "from\n", "at\n")  # beginnings of headings that continue the heading of the column before
 
 
-class NumberTable(RichTable):
+class NumberTable(Table):
     """A table that takes the width that it needs: at least that of its longest words, where texts may be wrapped."""
 
     def __init__(self, folds: bool, **options: Any) -> None:
@@ -64,30 +61,6 @@ class NumberTable(RichTable):
         part = copy(self)
         part.columns = [replace(column, _index=i) for i, column in enumerate(columns)]
         return part
-
-
-def on_terminal(table: Table) -> RichTable:
-    """Return a table as rich draws it."""
-    look: dict[str, Any] = {"padding": (0, table.gap, 0, 0), "show_edge": False}
-    if table.title is None:
-        drawn: RichTable = NumberTable(table.folds, box=box.HORIZONTALS, pad_edge=False, **look)
-    else:
-        look |= {"title_justify": "left", "title_style": "italic"}
-        drawn = RichTable(title=table.title, box=box.SIMPLE_HEAD, **look)
-    wrapped = any(column.wraps for column in table.columns)
-    for column, cells in zip(table.columns, table.cells, strict=True):
-        whole = max(map(len, cells), default=0) if wrapped and not column.wraps else None
-        drawn.add_column(
-            column.heading,
-            justify="right" if column.number else "left",
-            no_wrap=not column.wraps,
-            overflow="ellipsis" if table.title is None else "fold",
-            width=column.width,
-            min_width=column.least or whole,
-        )
-    for i, row in enumerate(zip(*table.cells, strict=True)):
-        drawn.add_row(*row, style="bold" if i in table.strong else None)
-    return drawn
 
 
 def text_of(shown: Any, width: int) -> str:

@@ -150,7 +150,7 @@ _TIMES = ("Times New Roman", "Nimbus Roman", "TeX Gyre Termes", "Liberation Seri
 _HELVETICA = ("Arial", "Helvetica", "Nimbus Sans", "TeX Gyre Heros", "Liberation Sans", "DejaVu Sans")
 
 
-class Column(NamedTuple):
+class JournalColumn(NamedTuple):
     """Typesetting of a journal's figures of one width."""
 
     inches: float
@@ -168,16 +168,16 @@ class Column(NamedTuple):
         return next((name for name in self.fonts if name in installed), self.fonts[-1])
 
 
-COLUMNS: Mapping[str, Column] = {
-    "ieee1": Column(3.5, 8.0, _TIMES, "stix"),
-    "ieee2": Column(7.16, 8.0, _TIMES, "stix"),
-    "springer1": Column(84 * _MM, 9.0, _HELVETICA, "dejavusans"),
-    "springer2": Column(174 * _MM, 9.0, _HELVETICA, "dejavusans"),
+COLUMNS: Mapping[str, JournalColumn] = {
+    "ieee1": JournalColumn(3.5, 8.0, _TIMES, "stix"),
+    "ieee2": JournalColumn(7.16, 8.0, _TIMES, "stix"),
+    "springer1": JournalColumn(84 * _MM, 9.0, _HELVETICA, "dejavusans"),
+    "springer2": JournalColumn(174 * _MM, 9.0, _HELVETICA, "dejavusans"),
 }
 """IEEE's single and double column (3.5 and 7.16 in), Springer's (84 and 174 mm)."""
 
 
-def column(name: str) -> Column:
+def column(name: str) -> JournalColumn:
     """Return a column by name.
 
     Raises:

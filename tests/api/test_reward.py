@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 import pytest
-from coopenv.bench.pages import DRIVERS, measured_drivers
 from numpy.testing import assert_allclose
 
 import coopenv
@@ -20,6 +19,7 @@ from coopenv.policies import load_agent
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.policies.scripted import Peek
 from coopenv.scenario import load_scenario
+from sitegen.environments.sensing import DRIVERS, measured_drivers
 from tests.helpers.env_suite import SHIPPED, largest_slow
 from tests.helpers.four_way import FOUR_WAY
 

@@ -21,8 +21,7 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.base.installation import data_directory
 from coopenv.cli.app import main
 from coopenv.estimation import compiled
-from coopenv.report.table import Table
-from coopenv.report.terminal import Terminal, text_of
+from coopenv.report.terminal import Terminal
 from coopenv.runs import console as module
 from coopenv.runs import scenario_text as words
 from coopenv.runs.console import Progress, compile_notice, note_overwritten
@@ -409,16 +408,6 @@ def test_what_is_drawn_is_described() -> None:
     ):
         assert said in text, said
     assert "[difficulty]" not in text
-
-
-def test_columns_that_do_not_fit_stand_in_a_further_table() -> None:
-    table = Table.of_texts(["\nvehicle"], ["start\n[m]", "\n[deg]", "RMSE\n[m]"], folds=True)
-    table.add("vehicle_1", "0.1", "4", "0.2")
-    headings = ["start", "vehicle [m] [deg]", "vehicle_1 0.1 4", "RMSE", "vehicle [m]", "vehicle_1 0.2"]
-    folded = [" ".join(line.split()) for line in text_of(table, 25).splitlines() if "─" not in line]
-    assert folded == headings
-    assert text_of(table, 40).count("vehicle_1") == 1
-    assert text_of(table, 20).count("vehicle_1") == 2
 
 
 @pytest.mark.parametrize(

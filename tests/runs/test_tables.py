@@ -16,10 +16,9 @@ from scipy.spatial.transform import Rotation
 
 import coopenv
 from coopenv.base.installation import load_reference
-from coopenv.bench.cards import KINDS
+from coopenv.bench.evaluation import KINDS
 from coopenv.cli.app import main
 from coopenv.estimation.observability import Trajectory
-from coopenv.report.table import Table
 from coopenv.runs.command import Results
 from tests.helpers.four_way import FOUR_WAY
 
@@ -145,12 +144,6 @@ def test_a_missing_package_is_one_line(results: Results, tmp_path: Path, monkeyp
     with pytest.raises(coopenv.CoopenvError, match=r"pip install '\.\[tables\]'"):
         results.to_parquet(tmp_path / "x.parquet")
     assert not list(tmp_path.iterdir())
-
-
-def test_columns_are_in_the_order_of_the_rows() -> None:
-    table = Table.of_data({"name": ["b", "a"], "way_m": np.array([1.0, np.inf]), "count": [1, 2]}, ("name",))
-    assert table.csv() == "name,way_m,count\nb,1.0,1\na,,2\n"
-    assert table.units == {"way_m": "m", "count": "1"}
 
 
 def test_an_evaluation_in_python(capsys: Any, tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ from PIL import Image
 
 import coopenv
 from coopenv.base.installation import data_directory
-from coopenv.bench.cards import shown, stress
+from coopenv.bench.contest import stress
+from coopenv.bench.evaluation import shown
 from coopenv.cli.app import main
 from coopenv.evaluation import METRICS
 from coopenv.scenario import load_scenario

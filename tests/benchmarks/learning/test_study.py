@@ -8,8 +8,9 @@ from typing import Any
 from weakref import ref
 
 import pytest
-from coopenv.bench.learning import Judge, Study, place_of, read_study
 
+from benchmarks.learning.judge import Judge
+from benchmarks.learning.study import Study, place_of, read_study
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import data_directory
 from coopenv.evaluation import Difference, Episodes, Result, compare_paired, drive, score
@@ -123,7 +124,7 @@ def test_figures_stay_and_episodes_go(monkeypatch: pytest.MonkeyPatch) -> None:
         driven.append(ref(episodes))
         return episodes
 
-    monkeypatch.setattr("coopenv.bench.learning.drive", watched)
+    monkeypatch.setattr("benchmarks.learning.judge.drive", watched)
     judge = Judge(2)
 
     def findings(environment: str) -> tuple[list[Result], list[Difference]]:

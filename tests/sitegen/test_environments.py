@@ -9,23 +9,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from coopenv.bench.pages import (
-    DRIVERS,
-    SETTINGS,
-    environment_page,
-    fingerprint,
-    index_text,
-    measured_drivers,
-    studied,
-    value_of_sensing_text,
-)
 from PIL import Image
 
 from coopenv.base.installation import list_envs
 from coopenv.bench.cards import OVERVIEW
-from coopenv.cli.app import main
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.viz.topview_ground import HEIGHT, WIDTH
+from sitegen.environments.__main__ import main
+from sitegen.environments.page import environment_page, index_text
+from sitegen.environments.sensing import (
+    DRIVERS,
+    SETTINGS,
+    fingerprint,
+    measured_drivers,
+    studied,
+    value_of_sensing_text,
+)
 from tests.helpers.commands import refused
 
 PAGES = Path(__file__).parents[2] / "docs" / "environments"
@@ -53,7 +52,7 @@ def small(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("name", list_envs())
 def test_the_page_of_every_environment_is_up_to_date(name: str) -> None:
     page, measure = PAGES / f"{name}.md", " --measure" if measured_drivers(name) else ""
-    again = f"run: coopenv page {name} --out docs/environments"
+    again = f"run: python -m sitegen.environments {name} --out docs/environments"
     assert page.is_file(), again + measure
     assert page.read_text(encoding="utf-8") == environment_page(name, load_scenario(name), PAGES), again
     assert not measure or (PAGES / f"{name}.json").is_file(), again + measure
@@ -88,7 +87,7 @@ def test_the_index_lists_every_environment() -> None:
 
 
 def test_a_page_says_what_the_file_says(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["page", str(small), "--out", str(tmp_path / "pages")]) == 0
+    assert main([str(small), "--out", str(tmp_path / "pages")]) == 0
     assert "small.md" in capsys.readouterr().out
     made = {"small.md", "small.png", "small.webp"} | ({"small_3d.webp"} if find_spec("pyvista") else set())
     assert {path.name for path in (tmp_path / "pages").iterdir()} == made
@@ -121,7 +120,7 @@ def test_what_moves_has_a_film(tmp_path: Path) -> None:
     out = tmp_path / "pages"
     out.mkdir()
     (out / "still.webp").write_bytes(b"earlier")
-    assert main(["page", str(moving), str(still), "--out", str(out)]) == 0
+    assert main([str(moving), str(still), "--out", str(out)]) == 0
     assert sorted(path.name for path in out.glob("*.webp")) == ["moving.webp"]
     with Image.open(out / "moving.webp") as film:
         assert film.n_frames == 13  # 2 s at 6 pictures a second, and the first
@@ -129,13 +128,13 @@ def test_what_moves_has_a_film(tmp_path: Path) -> None:
     assert "](moving.webp)" in text and "estimated by `riccati`" in text and "driven by" not in text
     assert ".webp" not in (out / "still.md").read_text(encoding="utf-8")
     before = (out / "moving.webp").stat().st_mtime_ns
-    assert main(["page", str(moving), "--no-film", "--out", str(out)]) == 0
+    assert main([str(moving), "--no-film", "--out", str(out)]) == 0
     assert (out / "moving.webp").stat().st_mtime_ns == before
     assert "](moving.webp)" in (out / "moving.md").read_text(encoding="utf-8")
 
 
 def test_the_dial_is_measured_and_shown(tmp_path: Path) -> None:
-    assert main(["page", "facade", "--measure", "--worlds", "2", "--no-film", "--out", str(tmp_path)]) == 0
+    assert main(["facade", "--measure", "--worlds", "2", "--no-film", "--out", str(tmp_path)]) == 0
     value = json.loads((tmp_path / "facade.json").read_text())
     assert {(row["sensing"], row["agent"]) for row in value["rows"]} == {
         (how, who) for how in SETTINGS for who in DRIVERS
@@ -186,19 +185,19 @@ def test_a_page_states_the_version_of_its_score_and_what_the_radio_s_loss_measur
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["page"], "name environments, or give --all"),
-        (["page", "facade", "--all"], "name environments, or give --all"),
-        (["page", "facad"], "did you mean 'facade'"),
-        (["page", "facade", "envs/facade.toml"], "two environments have the same name"),
-        (["page", "busy_intersection", "--measure"], "all motion here is prescribed"),
+        ([], "name environments, or give --all"),
+        (["facade", "--all"], "name environments, or give --all"),
+        (["facad"], "did you mean 'facade'"),
+        (["facade", "envs/facade.toml"], "two environments have the same name"),
+        (["busy_intersection", "--measure"], "all motion here is prescribed"),
     ],
 )
 def test_mistakes_are_one_line(arguments: list[str], words: str, tmp_path: Path) -> None:
-    assert words in refused(*arguments, "--out", str(tmp_path / "pages"))
+    assert words in refused(*arguments, "--out", str(tmp_path / "pages"), command=main)
     assert not list(tmp_path.rglob("*.*"))
 
 
 def test_figures_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     (tmp_path / "facade.json").write_text('{"rows": []}')
-    assert "facade.json: no figures of a page" in refused("page", "facade", "--out", str(tmp_path))
+    assert "facade.json: no figures of a page" in refused("facade", "--out", str(tmp_path), command=main)
     assert [path.name for path in tmp_path.iterdir()] == ["facade.json"]

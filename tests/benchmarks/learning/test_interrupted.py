@@ -1,10 +1,11 @@
-"""`coopenv bench learning` in processes of its own: agents with cards, and going on after kill -9."""
+"""`python -m benchmarks.learning` in processes of its own: agents with cards, and going on after kill -9."""
 
 from __future__ import annotations
 
 import json
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ pytest.importorskip("tensorboard", reason="needs the extra 'train'")
 import coopenv
 from coopenv.policies import find_agent, load_agent
 from coopenv.training.settings import read_settings
-from tests.helpers.processes import COOPENV, start, wait_until
+from tests.helpers.processes import start, wait_until
 
 pytestmark = [pytest.mark.train, pytest.mark.slow]
 STUDY = 'settings = "train.toml"\nenvironments = ["open_square"]\narms = ["quality", "plain"]\nseeds = [1, 2]\n'
@@ -35,7 +36,7 @@ scenario.reward.weights.position_uncertainty = 2.0
 [arms.plain]
 scenario.reward.weights.position_uncertainty = 0.0
 """
-COMMAND = (*COOPENV, "bench", "learning", "study.toml", "--worlds", "4", "--jobs", "2", "--logs", "logs")
+COMMAND = (sys.executable, "-m", "benchmarks.learning", "study.toml", "--worlds", "4", "--jobs", "2", "--logs", "logs")
 
 
 @pytest.fixture(autouse=True)
