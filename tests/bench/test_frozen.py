@@ -94,14 +94,6 @@ def test_differences_from_the_shipped_result_are_named(tmp_path: Path, monkeypat
     ]
 
 
-def test_actions_are_recorded_once(capsys: pytest.CaptureFixture[str]) -> None:
-    assert freeze.main(["v1"]) == 2
-    assert "exists: a version never changes" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        freeze.main(["v0"])
-    assert "invalid choice: 'v0'" in capsys.readouterr().err
-
-
 def test_actions_of_a_driver_are_played_back() -> None:
     """The present actions of `peek`, rounded, lead to their own record."""
     [scene] = Frozen("v1").scenes(["facade"])

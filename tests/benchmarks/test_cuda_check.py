@@ -23,7 +23,6 @@ from benchmarks.cuda_check import (
     catalogue,
     check_module,
     limits,
-    main,
     parsed,
     put,
 )
@@ -151,25 +150,6 @@ def test_limits_hold_and_records_are_not_copied(tmp_path: Path) -> None:
 def test_limits_of_parts_of_robust_hold(tmp_path: Path) -> None:
     """Their loops over matrices are where registers run out first: a third 6x6 matrix doubled the stack."""
     assert len(checked(tmp_path, "--only", "robust_(correct|fuse)", "--dtype", "float32", "--arch", "90")) == 2
-
-
-def test_mistakes_are_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert main(["--only", "nothing", "--dtype", "float32", "--out", str(tmp_path)]) == 2
-    assert capsys.readouterr().err == "error: --only: no module has 'nothing' in its name\n"
-    assert main(["--accept", "--arch", "90"]) == 2
-    assert capsys.readouterr().err.startswith("error: --accept needs both precisions and all architectures")
-    for wrong, words in (
-        (["--only", "("], "expected a regular expression, got '('"),
-        (["--jobs", "0"], "whole number of at least 1"),
-    ):
-        with pytest.raises(SystemExit):
-            main(wrong)
-        assert wrong[0] in (error := capsys.readouterr().err) and words in error
-    monkeypatch.setattr("benchmarks.cuda_check.metadata.files", lambda name: None)
-    assert main(["--only", "host", "--dtype", "float32", "--out", str(tmp_path)]) == 2
-    assert "pip install --no-deps nvidia-cuda-nvcc" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from inspect import signature
 from pathlib import Path
@@ -16,7 +15,6 @@ from benchmarks import adversary, evidence, linear_case, linearisation, receipt
 from benchmarks.planar.__main__ import main
 from benchmarks.planar.changes import blindfolded, changed, clocks, drifting, hidden, misread, odometry, part
 from benchmarks.planar.lies import Drifting, Replaying
-from benchmarks.stages import robust_stages
 from coopenv.bench.observers.faults import variant_of
 from coopenv.mrclam.recording import recording_of
 from coopenv.observers import run
@@ -25,7 +23,6 @@ from coopenv.observers.recording import Recording
 from coopenv.observers.robust import constants
 from coopenv.runs import record
 from coopenv.scenario import load_scenario
-from tests.helpers.commands import refused
 from tests.helpers.mrclam_files import barrier_robots
 
 
@@ -246,33 +243,6 @@ def test_exclusions_are_noted_with_their_time_and_target() -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "line", "message"),
-    [
-        (receipt.main, "--first -5", "--first: expected a whole number of at least 0, got -5"),
-        (receipt.main, "--seeds 0", "--seeds: expected a whole number of at least 1, got 0"),
-        (evidence.main, "undeclared --seeds 0", "--seeds: expected a whole number of at least 1, got 0"),
-        (adversary.main, "--rate nan", "--rate: expected a number of at least 0.001, got nan"),
-        (robust_stages.main, "--worlds many", "--worlds: expected a whole number of at least 1, got many"),
-    ],
-)
-def test_numbers_of_options_are_within_bounds(
-    command: Callable[[Sequence[str]], int], line: str, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        command(line.split())
-    assert message in capsys.readouterr().err.splitlines()[-1]
-
-
-def test_stages_of_an_unknown_environment_are_refused() -> None:
-    assert "unknown environment 'nosuch'" in refused("nosuch", command=robust_stages.main)
-
-
-def test_unknown_constants_are_named() -> None:
-    error = refused("--constants", "FAULT_GAT", command=receipt.main)
-    assert "FAULT_GAT" in error and "FAULT_GATE" in error
-
-
-@pytest.mark.parametrize(
     ("name", "ratio"),
     [
         ("one sender, every report fused", 1.0),
@@ -317,9 +287,3 @@ def test_the_constrained_point_has_the_least_bias_in_a_lane_and_the_variance_red
         for point, variance in (("prediction", False), ("prediction", True), ("constrained", False))
     }
     assert abs(bias["constrained", False]) < 0.01 < bias["prediction", True] < 0.5 * bias["prediction", False]
-
-
-def test_an_odd_number_of_seeds_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert linearisation.main(["--seeds", "3"]) == 2 and "even number of seeds" in capsys.readouterr().err
-    assert linear_case.main([]) == 0
-    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80

@@ -15,7 +15,6 @@ from benchmarks import view
 from benchmarks.gpu import work
 from benchmarks.gpu.__main__ import PAGE, main
 from benchmarks.gpu.plan import Stage, plan
-from benchmarks.gpu.prepare import requirements
 from benchmarks.gpu.runner import failures, run
 from benchmarks.gpu.table import BEGIN, END, put, section
 from benchmarks.stages.__main__ import main as stages_main
@@ -24,7 +23,6 @@ from benchmarks.stages.against import HERE
 from benchmarks.stages.rounds import alternate
 from coopenv import load_scenario
 from coopenv.base.errors import CoopenvError
-from tests.helpers.commands import refused
 
 HEAD = {"command": "python -m benchmarks.gpu", "coopenv": "1.2.3", "device": "cuda:0"}
 
@@ -138,29 +136,6 @@ def test_bad_worlds_and_failed_tests_are_failures() -> None:
     assert failures(document) == ["agreement, riccati", "tests"]
 
 
-def test_a_torch_that_is_there_is_not_installed_again() -> None:
-    with_it, without = requirements(has_torch=True), requirements(has_torch=False)
-    assert {*without} - {*with_it} == {"torch"}
-    assert {line.partition(">")[0] for line in with_it} >= {"warp-lang", "numpy", "tyro", "tensorboard", "pytest"}
-
-
-def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "file").touch()
-    (tmp_path / "stages.json").write_text(json.dumps({**HEAD, "stages": [{}]}))
-    for arguments, words in (
-        (["--device", "tpu"], "unknown device 'tpu'"),
-        (["--device", "cpu", "--out", str(tmp_path / "file" / "gpu.json")], "cannot write to"),
-        (["--table", str(tmp_path / "none.json")], "none.json"),
-        (["--table", str(tmp_path / "file")], "file: expected a JSON file that make gpu has written"),
-        (["--table", str(tmp_path / "stages.json")], "stages.json: expected a JSON file that make gpu has written"),
-    ):
-        assert words in refused(*arguments, command=main)
-    for wrong in (["--worlds", "0"], ["--minutes", "nan"]):
-        with pytest.raises(SystemExit):
-            main(wrong)
-        assert f"{wrong[0]}: expected a" in (error := capsys.readouterr().err) and f"got {wrong[1]}" in error
-
-
 @pytest.mark.slow
 def test_the_whole_run_on_a_cpu(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "gpu.json"
@@ -206,11 +181,6 @@ def test_what_is_switched_off_does_not_happen() -> None:
     assert whole.view("gramian_time").any() and not silent.view("gramian_time").any()
 
 
-def test_a_folder_without_coopenv(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert stages_main(["--against", str(tmp_path), "--worlds", "1"]) == 2
-    assert "no checkout of coopenv" in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_the_whole_command(capsys: pytest.CaptureFixture[str]) -> None:
     few = ["--worlds", "2", "--rounds", "2", "--decisions", "1"]
@@ -238,10 +208,3 @@ def test_simulating_is_a_part_of_what_is_measured(
         assert frames > 0.0
         assert cpu > 0.0
         assert 0.0 < without < scaled
-
-
-def test_an_unknown_environment_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert view.main(["nosuch"]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: unknown environment 'nosuch'; known: ")
-    assert error.count("\n") == 1

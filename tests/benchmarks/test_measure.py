@@ -14,7 +14,7 @@ import pytest
 
 import coopenv
 from benchmarks.speed import run
-from benchmarks.speed.__main__ import command, main, parser
+from benchmarks.speed.__main__ import main
 from benchmarks.speed.cases import Case
 from benchmarks.speed.coopenv_cases import own_cases
 from benchmarks.speed.growth import MOST_NEARBY, Sweep, fit_power_law, growth_scenario, summarise
@@ -27,7 +27,6 @@ from benchmarks.speed.tables import (
 from benchmarks.speed.workers import WorkerError, Workers
 from coopenv.api.engine import Engine
 from coopenv.scenario.schema import neighbour_sets
-from tests.helpers.commands import refused
 from tests.helpers.fake_library import FAKE, SHARE, STEP, fake_case
 
 
@@ -200,35 +199,6 @@ def check(document: dict[str, Any]) -> None:
 def terminal(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("busy_intersecton", "did you mean 'busy_intersection'"),
-        ("--out occupied", "it is not a folder"),
-        ("--out occupied/below", "cannot write to"),
-        ("--out taken", "speed.json: it is a folder"),
-        ("--set noise.enabld=false", "did you mean 'enabled'"),
-    ],
-)
-def test_mistakes_end_with_one_line_and_status_2(line: str, message: str) -> None:
-    Path("occupied").write_text("")
-    Path("taken/speed.json").mkdir(parents=True)
-    assert message in refused(*line.split(), command=main)
-
-
-@pytest.mark.parametrize("option", ["--repeats 0", "--seconds 0", "--seconds nan", "--seconds soon"])
-def test_numbers_are_positive(option: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        main(option.split())
-    assert option.split()[0] in capsys.readouterr().err.splitlines()[-1]
-
-
-def test_the_command_is_written_as_it_can_be_typed() -> None:
-    line = "urban_crossing --set horizon=20.0 --seconds=1.5 --growth --no-peers"
-    asked = parser().parse_args([*line.split(), "--out", "here"])
-    assert command(asked) == f"python -m benchmarks.speed {line}"
 
 
 def test_a_run_with_a_fake_peer(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

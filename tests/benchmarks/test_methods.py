@@ -15,7 +15,6 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import scenario_path
 from coopenv.policies import Policy
 from coopenv.scenario import load_scenario
-from tests.helpers.commands import refused
 
 SMALL = """
 decisions = 400
@@ -186,15 +185,6 @@ def test_the_page_in_the_documents_is_that_of_the_results() -> None:
 def test_the_verdict_names_a_winner_only_where_intervals_are_apart(shift: float, words: str) -> None:
     runs = np.arange(5.0)
     assert report.verdict({"a": [runs], "b": [runs + shift]}).startswith(words)
-
-
-def test_mistakes_are_one_line(tmp_path: Path) -> None:
-    for old, new, words in (
-        ("decisions = 400", "decisions = 0", "decisions"),
-        ('"route_follower"]', '"ppo"]', "ppo is a method and a reference"),
-        ('learner = "coopenv"', 'learner = "rllib"', "learner"),
-    ):
-        assert words in refused(str(written(tmp_path, SMALL.replace(old, new))), command=command.main)
 
 
 @pytest.mark.train

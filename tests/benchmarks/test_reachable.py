@@ -5,15 +5,13 @@ from __future__ import annotations
 from contextlib import closing
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 
-from benchmarks.reachable import OpenLoop, driven, main, searched
+from benchmarks.reachable import OpenLoop, driven, searched
 from coopenv.api.engine import Engine
 from coopenv.evaluation import held_out_seeds
 from coopenv.policies import load_agent
 from coopenv.scenario import load_scenario
-from tests.helpers.commands import refused
 
 
 def test_a_repeated_plan_leads_where_its_agent_was_and_the_search_finds_no_worse() -> None:
@@ -26,18 +24,3 @@ def test_a_repeated_plan_leads_where_its_agent_was_and_the_search_finds_no_worse
         assert_allclose(again.stated, outcome.stated[0], rtol=1e-6)
         best = searched(many, actions[:, 0], seed, 2, lambda: None)
     assert best.cost[0] <= outcome.cost[0] + 1e-6
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["nowhere"], "nowhere"),
-        (["busy_intersection"], "position_std"),
-        (["scout_platoon", "--agents", "nobody"], "nobody"),
-        (["scout_platoon", "--worlds", "1"], "--worlds"),
-        (["scout_platoon", "--copies", "1"], "--copies"),
-        (["scout_platoon", "--rounds", "0"], "--rounds"),
-    ],
-)
-def test_mistakes_are_one_line(arguments: list[str], words: str) -> None:
-    assert words in refused(*arguments, command=main)

@@ -1,9 +1,8 @@
 """The table of what each part of `robust` buys."""
 
 import numpy as np
-import pytest
 
-from benchmarks.receipt import changes_of, constant_table, main, numbers, parts
+from benchmarks.receipt import changes_of, constant_table, parts
 
 
 def test_every_part_and_several_together_replace_what_exists() -> None:
@@ -11,24 +10,6 @@ def test_every_part_and_several_together_replace_what_exists() -> None:
         assert all(hasattr(module, name) for module, name, _ in changes_of(part))
     together = changes_of("readmission + prior+established pose")
     assert [name for _, name, _ in together] == ["test_excluded", "own_fault_variance", "MODEL_ERROR"]
-
-
-@pytest.mark.parametrize(
-    ("asked", "says"),
-    [
-        (["--without", "readmision"], "did you mean 'readmission'"),
-        (["--without", "prior + focal length"], "cannot be left out together"),
-        (["--without", "gyro bias*2"], "unknown part 'gyro bias*2'"),
-        (["--without", "RISK*two"], "'two'"),
-        (["--constants", "RISKY"], "unknown constants RISKY"),
-    ],
-)
-def test_wrong_parts_and_constants_are_one_line(
-    asked: list[str], says: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(asked) == 2
-    error = capsys.readouterr().err
-    assert says in error and error.count("\n") == 1
 
 
 def test_a_ratio_has_the_standard_error_over_the_seeds() -> None:
@@ -40,7 +21,3 @@ def test_a_ratio_has_the_standard_error_over_the_seeds() -> None:
     error = values.std(ddof=1) / 2.0 / 2.0  # of the mean of four, as a share of 2
     assert f"| 1.5({error * 10:.0f}) |" in shown.splitlines()[-1]
     assert "| tracking: jump | 0.5 |" in shown
-
-
-def test_at_most_forty_numbers_follow_from_no_other_one() -> None:
-    assert len(numbers()) <= 40

@@ -7,7 +7,6 @@ import pytest
 pytest.importorskip("cv2", reason="needs the extra 'vision'")
 
 from benchmarks import vision
-from tests.helpers.commands import refused
 
 
 def test_near_tags_are_found_and_the_table_has_a_row_each(capsys: pytest.CaptureFixture[str]) -> None:
@@ -17,8 +16,3 @@ def test_near_tags_are_found_and_the_table_has_a_row_each(capsys: pytest.Capture
     for distance, _, share, rmse, _, false, *_ in rows[:-1]:
         if float(distance) <= 2.0:
             assert share == "100.0(0.0)" and float(rmse.split("(")[0]) < 0.05 and false == "0"
-
-
-@pytest.mark.parametrize("given", [["--family", "tag36h12"], ["--frames", "9"], ["--side", "0"]])
-def test_what_is_wrong_is_one_line(given: list[str]) -> None:
-    refused(*given, command=vision.main)

@@ -41,8 +41,8 @@ def test_records_have_the_formats_and_units_of_their_columns() -> None:
     table = Table.of(
         columns, [{"name": "a", "error_m": 0.5, "count": 3}, {"name": "b|c", "error_m": np.nan, "count": 4}]
     )
-    assert table.markdown() == "|  | RMSE [m] | count |\n|---|---|---|\n| a | 0.50 | 3 |\n| b\\|c | - | 4 |"
-    assert lines(table, 40) == ["RMSE", "[m] count", "a 0.50 3", "b|c - 4"]
+    assert table.markdown() == "|  | RMSE [m] | count |\n|---|---|---|\n| a | 0.500 | 3 |\n| b\\|c | - | 4 |"
+    assert lines(table, 40) == ["RMSE", "[m] count", "a 0.500 3", "b|c - 4"]
     assert table.csv() == "name,error_m,count\na,0.5,3\nb|c,,4\n"
 
 

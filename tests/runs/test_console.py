@@ -28,7 +28,7 @@ from coopenv.runs.console import Progress, compile_notice, note_overwritten
 from coopenv.runs.scenario_text import IMAGE_FIELDS, settings
 from coopenv.runs.summary import describe_scenario
 from coopenv.scenario import parse_scenario
-from coopenv.scenario.bodies import ConstantMotion, InitialEstimate, SegmentMotion, TwistSegment, WaypointMotion
+from coopenv.scenario.bodies import SegmentMotion, WaypointMotion
 from coopenv.scenario.files import apply_vehicle_defaults, schema_text
 from coopenv.world import launch
 from tests.helpers.commands import printed
@@ -224,20 +224,6 @@ def test_everything_fits_and_nothing_is_cut_off(name: str) -> None:
     assert set(scenario.target_names) <= {token.strip(",") for token in tokens}
 
 
-def test_the_sections_of_the_busy_intersection() -> None:
-    lines = [line.split() for line in described("busy_intersection", 100).splitlines()]
-    assert ["landmark", "position", "motion", "body"] in lines
-    assert ["SL1", "(-4,", "5,", "3)", "stands", "still", "none"] in lines
-    assert next(line for line in lines if line[:1] == ["bearing.scale"])[:3] == ["bearing.scale", "*", "0.005"]
-    assert next(line for line in lines if line[:1] == ["loss"])[:2] == ["loss", "0"]
-    text = described("busy_intersection", 140)
-    assert "keeps 0.6 m/s to the left" in text
-    assert "off by 90 deg about z" in text
-    assert "Horizon: 50 s, 500 decisions of 6 camera ticks each." in text
-    assert "wheelbase" not in text
-    assert "wheelbase" in described(FOUR_WAY, 100)
-
-
 def test_settings_of_the_image_are_left_out_where_there_is_none() -> None:
     keys = {name: [key for key, *_ in settings(coopenv.load_scenario(name).camera)] for name in coopenv.list_envs()}
     assert coopenv.load_scenario("busy_intersection").camera.model == "omnidirectional"
@@ -276,33 +262,6 @@ def test_overrides_are_described(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_scenario_texts_are_not_read_as_markup() -> None:
     assert "[bold]loud[/bold]" in described("busy_intersection", 80, title="[bold]loud[/bold]")
-
-
-def test_starts_and_estimates_in_words() -> None:
-    half = 0.7071067811865476
-    belief = InitialEstimate(position_radius=0.3, orientation_angle="uniform")
-    assert words.estimate(belief).splitlines() == [
-        "true position",
-        "within 0.3 m",
-        "true orientation",
-        "turned at random, over SO(3)",
-    ]
-    belief = InitialEstimate(position=(1.0, 2.0, -0.0), orientation_offset_wxyz=(half, 0.0, -half, 0.0))
-    assert words.estimate(belief).splitlines() == ["(1, 2, 0)", "true orientation", "off by -90 deg about y"]
-    assert words.turn((half, 0.5, 0.5, 0.0)) == "90 deg about (0.707, 0.707, 0)"
-    assert words.turn((1.0, 0.0, 0.0, 0.0)) == "0 deg"
-    assert words.orientation(None, (half, half, 0.0, 0.0)) == "turned 90 deg about x"
-
-
-def test_motions_in_words() -> None:
-    assert words.motion(ConstantMotion(linear=(-1.0, 0.0, 0.0))) == "keeps 1 m/s backward"
-    turning = ConstantMotion(linear=(1.0, 2.0, 0.0), angular=(0.0, 0.0, 0.5))
-    assert words.motion(turning) == "keeps (1, 2, 0) m/s, turning at (0, 0, 0.5) rad/s"
-    assert words.motion(ConstantMotion(linear=(0.0, 0.0, 0.0))) == "keeps 0 m/s"
-    assert TwistSegment(duration=1.0).linear == (0.0, 0.0, 0.0)
-    waypoints = [{"time": 0.0, "position": (0, 0, 0)}, {"time": 8.0, "position": (4, 0, 0)}]
-    motion = WaypointMotion.model_validate({"kind": "waypoints", "waypoints": waypoints})
-    assert words.motion(motion) == "spline through 2 waypoints over 8 s"
 
 
 def test_the_published_schema_is_up_to_date() -> None:
@@ -382,32 +341,6 @@ def test_vehicles_may_leave_out_what_the_defaults_say(validator: Any) -> None:
     assert validator.is_valid(document)
     del document["horizon"]
     assert not validator.is_valid(document)
-
-
-def test_what_is_drawn_is_described() -> None:
-    raw = {
-        "title": "Drawn",
-        "horizon": 5.0,
-        "landmarks": [{"name": "sign", "position": [1, 2, 3], "position_spread": [0.5, 0.5, 0], "presence": 0.8}],
-        "landmark_groups": [
-            {"name": "posts", "count": 3, "boxes": [{"center": [5, 5], "half": [2, 1]}], "height": [0.4, 1.2]},
-            {"name": "kerb", "count": 1, "lines": [{"start": [0, 3], "end": [9, 3]}], "height": [1, 1]},
-        ],
-        "routes": [
-            {"name": "left", "waypoints": [[-8, 0], [0, 0], [0, 8]], "corner_radius": 1.5, "lateral_spread": 0.1},
-            {"name": "ahead", "waypoints": [[-8, 0], [8, 0]], "wander": 0.2, "start_spread": 1.0},
-        ],
-        "vehicles": [{"routes": ["left", "ahead"], "motion": {"kind": "driven"}}],
-        "randomisation": {"camera_range": [0.8, 1.2]},
-    }
-    text = printed(*describe_scenario(parse_scenario(raw, "test")), width=160)
-    for said in (
-        *("end of its route: left or ahead", "(-8, 0), (0, 0), (0, 8)", "radius 1.5", "shifted by +- 0.1"),
-        *("wanders by 0.2", "begun along the first 1", "there with 80 %", "+- (0.5, 0.5, 0)", "drawn by group posts"),
-        *("(5, 5) +- (2, 1)", "(0, 3) to (9, 3)", "0.4 to 1.2", "camera_range *"),
-    ):
-        assert said in text, said
-    assert "[difficulty]" not in text
 
 
 @pytest.mark.parametrize(

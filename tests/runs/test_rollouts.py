@@ -22,9 +22,10 @@ from coopenv.estimation import Sight
 from coopenv.estimation.metrics import CONVERGED
 from coopenv.estimation.observability import Trajectory, analyse_observability
 from coopenv.policies import load_agent
+from coopenv.report.table import Table
 from coopenv.runs import Rollout, rollout
 from coopenv.runs.command import noise_note
-from coopenv.runs.console import gaps, legend, metrics_table, rates, remarks
+from coopenv.runs.console import COLUMNS, gaps, legend, rates, remarks
 from coopenv.runs.recorder import drive_vehicles
 from coopenv.runs.rollouts import Ending, outcome_line, run_metrics, theory_rates, vehicle_metrics
 from tests.helpers.commands import printed, refused
@@ -216,10 +217,10 @@ def test_the_table_has_a_row_per_vehicle_and_a_legend() -> None:
     assert math.isnan(vehicles[0]["ended_at_s"])
     assert vehicles[0]["rate_remark"] == "error fell below half within 1 tick, no rate to fit"
     assert list(remarks(vehicles)) == []
-    table = metrics_table(vehicles)
-    assert table.row_count == len(vehicles)
-    assert [str(column.header).split()[0] for column in table.columns][3:5] == ["settles", "converges"]
-    assert not any("-" in str(column.header) for column in table.columns)
+    table = Table.of(COLUMNS, vehicles, folds=True)
+    assert len(table) == len(vehicles)
+    assert [heading.split()[0] for heading in table.headings][3:5] == ["settles", "converges"]
+    assert not any("-" in heading for heading in table.headings)
     assert [*legend(5.0, 20.0, 6)] == [
         "Settles: stays below 0.5 m and 5 deg. Converges: stays below 0.1 m and 1 deg.",
         "RMSE and NEES: steady state, after 5 s. NEES of a consistent estimate: 6.",

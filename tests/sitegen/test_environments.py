@@ -169,19 +169,6 @@ def test_figures_that_are_older_than_the_environment_are_marked() -> None:
         assert ("has changed since" in text) == marked and "| sensed | peek | 50 [25, 75] |" in text
 
 
-def test_a_page_states_the_version_of_its_score_and_what_the_radio_s_loss_measures() -> None:
-    scenario = load_scenario("facade")
-    for version, words in (
-        ({}, "score 1, without those"),
-        ({"score": 2}, "for the rest of their way (score 2)"),
-    ):
-        text = value_of_sensing_text("facade", scenario, made_up_value_of_sensing(scenario) | version)
-        assert words in text and "radio" not in text
-    for name in ("open_square", "lighthouse"):
-        page = (PAGES / f"{name}.md").read_text(encoding="utf-8")
-        assert page.count("does not measure what messages are worth") == 1
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

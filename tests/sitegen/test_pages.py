@@ -41,17 +41,6 @@ def test_there_is_a_page_of_every_observer_agent_and_environment(made: dict[str,
     assert {page for page in listed if page.startswith("reference/")} <= made.keys()
 
 
-@pytest.mark.parametrize(
-    ("front", "observations"), [("README.md", "docs/terms.md"), ("docs/index.md", "docs/reference/observation.md")]
-)
-def test_what_people_come_for_is_one_click_away(front: str, observations: str) -> None:
-    """Pages on observers, training, bags and cars, and the meaning of an observation's entries."""
-    text = (ROOT / front).read_text(encoding="utf-8")
-    led_to = {target.partition("#")[0] for target in LINK.findall(text)}
-    found = {(Path(front).parent / target).as_posix() for target in led_to}
-    assert found >= {observations, *(f"docs/tutorials/{name}.md" for name in ("own_observer", "train", "logs", "cars"))}
-
-
 def test_pages_of_observers_say_where_they_come_from(made: dict[str, str]) -> None:
     for name, entry in zoo().items():
         page = made[f"reference/observers/{name}_.md"]

@@ -264,13 +264,6 @@ def test_mistakes_are_reported_before_the_work(
         coopenv.compare(observers, "overtaking", **options)
 
 
-@pytest.mark.parametrize("model", ["paper", "isotropic"])
-def test_the_note_on_the_papers_noise_stands_where_the_noise_is_the_papers(model: str) -> None:
-    found = coopenv.compare(["riccati"], "overtaking", 1, overrides={"horizon": 0.2, "noise.bearing.model": model})
-    text = report_text(found, {"command": "", "versions": {}})
-    assert ("The paper's bearing noise is smaller" in text) == (model == "paper")
-
-
 def test_the_report_is_sorted_and_has_errors_beside_its_figures(comparison: coopenv.Comparison) -> None:
     text = report_text(comparison, {"command": "<command>", "versions": {"numpy": "2"}})
     places = [text.index(f'<td class="name">{name}</td>') for name in comparison.ranked]
