@@ -10,7 +10,7 @@ import csv
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields
 from io import StringIO
 from typing import TYPE_CHECKING, Any, Self
 
@@ -106,11 +106,9 @@ class Table:
         return cls([*map(Column, values)], values, tuple(keys), tuple(mixed))
 
     @classmethod
-    def of_rows(cls, rows: Sequence[Any], *keys: str, names: Sequence[str] = ()) -> Self:
-        """Return dataclasses of one kind, at least one, with a column per field, or for some of them alone."""
-        assert is_dataclass(rows[0])
-        chosen = names or [each.name for each in fields(rows[0])]
-        return cls.of_data({name: [getattr(row, name) for row in rows] for name in chosen}, keys)
+    def of_rows(cls, rows: Sequence[Any], *keys: str) -> Self:
+        """Return dataclasses of one kind, at least one, with a column per field."""
+        return cls.of_data({each.name: [getattr(row, each.name) for row in rows] for each in fields(rows[0])}, keys)
 
     @classmethod
     def of_texts(
@@ -177,6 +175,11 @@ class Table:
         for i, row in enumerate(zip(*self.cells, strict=True)):
             drawn.add_row(*row, style="bold" if i in self.strong else None)
         yield drawn
+
+    def _repr_html_(self) -> str:
+        from coopenv.report.notebook import terminal_html
+
+        return terminal_html(self)
 
     def csv(self) -> str:
         """Return the values as CSV; numbers that are not finite are empty."""

@@ -42,15 +42,21 @@ def text(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
     return io.StringIO()
 
 
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time of the progress, s, which a test sets."""
+    now = [100.0]
+    monkeypatch.setattr(module, "monotonic", lambda: now[0])
+    return now
+
+
 def wait_for(text: io.StringIO, words: str) -> None:
     """Wait until a line says so; the line is written by another thread."""
     while words not in text.getvalue():
         sleep(0.005)
 
 
-def test_lines_where_there_is_no_terminal(text: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = [100.0]
-    monkeypatch.setattr(module, "monotonic", lambda: clock[0])
+def test_lines_where_there_is_no_terminal(text: io.StringIO, clock: list[float]) -> None:
     with Progress(Console(file=text, width=20), "simulating a long name", total=4) as progress:
         clock[0] = 120.0
         wait_for(text, "simulating a long name: 20 s\n")
@@ -61,29 +67,21 @@ def test_lines_where_there_is_no_terminal(text: io.StringIO, monkeypatch: pytest
         wait_for(text, "drawing: 50 % after 30 s, about 20 s left\n")
 
 
-def test_processes_that_finish_together_are_one_part(text: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = [0.0]
-    monkeypatch.setattr(module, "monotonic", lambda: clock[0])
+def test_processes_that_finish_together_are_one_part(text: io.StringIO, clock: list[float]) -> None:
     with Progress(Console(file=text), "comparing", total=20) as progress:
-        for now in (59.0, 60.0):
-            clock[0] = now
+        for clock[0] in (159.0, 160.0):
             progress.advance()
         assert progress.line() == "comparing: 10 % after 60 s"
-        for now in (119.0, 120.0):
-            clock[0] = now
+        for clock[0] in (219.0, 220.0):
             progress.advance()
         assert progress.line() == "comparing: 20 % after 120 s, about 480 s left"
 
 
-def test_time_counts_from_the_first_word(text: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = [100.0]
-    monkeypatch.setattr(module, "monotonic", lambda: clock[0])
-    progress = Progress(Console(file=text), "starting", total=1.0)
-    progress.__enter__()
-    for clock[0] in (103.0, 110.0):
-        progress.update(0.0, "watching peek")
-    assert progress.line() == "watching peek: 7 s"
-    progress.__exit__()
+def test_time_counts_from_the_first_word(text: io.StringIO, clock: list[float]) -> None:
+    with Progress(Console(file=text), "starting", total=1.0) as progress:
+        for clock[0] in (103.0, 110.0):
+            progress.update(0.0, "watching peek")
+        assert progress.line() == "watching peek: 7 s"
 
 
 def test_a_notebook_that_asks_for_colours_gets_lines(text: io.StringIO) -> None:
@@ -93,10 +91,8 @@ def test_a_notebook_that_asks_for_colours_gets_lines(text: io.StringIO) -> None:
 
 
 def test_time_left_is_not_reported_before_there_is_enough_to_go_by(
-    text: io.StringIO, monkeypatch: pytest.MonkeyPatch
+    text: io.StringIO, clock: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clock = [100.0]
-    monkeypatch.setattr(module, "monotonic", lambda: clock[0])
     monkeypatch.setattr(module, "HINT_FROM", 20.0)
     progress = Progress(Console(file=text), "simulating", total=400)
     progress.__enter__()
@@ -115,8 +111,7 @@ def test_time_left_is_not_reported_before_there_is_enough_to_go_by(
     assert "left" not in text.getvalue().partition("simulating: 5 %")[0]
 
 
-def test_in_real_time_the_time_left_is_known(text: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "monotonic", lambda: 100.0)
+def test_in_real_time_the_time_left_is_known(text: io.StringIO, clock: list[float]) -> None:
     with Progress(Console(file=text), "running", total=480, rate=60.0) as progress:
         progress.update(0)
         progress.update(3)
@@ -359,14 +354,10 @@ def test_an_overwritten_result_is_printed_in_one_line(
     assert line.startswith(f"overwrites {words}") and line.endswith(f" in {tmp_path}")
 
 
-def test_a_bar_has_no_end_before_its_results_are_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = [100.0]
-    monkeypatch.setattr(module, "monotonic", lambda: clock[0])
-    progress = Progress(Console(file=io.StringIO()), "simulating", total=4)
-    progress.__enter__()
-    progress.update(2)
-    clock[0] = 113.0
-    progress.update(4)
-    assert progress.line() == "simulating: 99 % after 13 s, results follow"
-    assert progress._bar.tasks[0].completed < 4
-    progress.__exit__()
+def test_a_bar_has_no_end_before_its_results_are_written(clock: list[float]) -> None:
+    with Progress(Console(file=io.StringIO()), "simulating", total=4) as progress:
+        progress.update(2)
+        clock[0] = 113.0
+        progress.update(4)
+        assert progress.line() == "simulating: 99 % after 13 s, results follow"
+        assert progress._bar.tasks[0].completed < 4

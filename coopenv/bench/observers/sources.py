@@ -154,38 +154,23 @@ class SimulatedRecords(RecordSource):
 
 
 @dataclass(frozen=True)
-class LogFile(RecordSource):
-    """A record in a file, as it is and with faults."""
+class GivenRecord(RecordSource):
+    """A record, or the file that has one, as it is and with faults."""
 
-    path: Path
+    given: Recording | Path = field(repr=False)
     selection: Selection = WHOLE
 
     def world(self) -> Recording:
-        """Return the file's record."""
+        """Return the record."""
         return self.selection.applied(self._whole(), self.name)
 
     def recording(self, variant: str, seed: int) -> Recording:
-        """Return the file's record with a fault."""
-        return self.fault(variant).applied(self.selection.applied(self._whole(seed), self.name), seed)
+        """Return the record with a fault, and with the faults of its scenario."""
+        whole = _with_faults(self._whole(), seed)
+        return self.fault(variant).applied(self.selection.applied(whole, self.name), seed)
 
-    def _whole(self, seed: int = 0) -> Recording:
-        """Return the file's record with the faults of its scenario."""
-        return _with_faults(open_recording(self.path), seed)
-
-
-@dataclass(frozen=True)
-class GivenRecord(RecordSource):
-    """A `Recording`, as it is and with faults."""
-
-    given: Recording = field(repr=False)
-
-    def world(self) -> Recording:
-        """Return it."""
-        return self.given
-
-    def recording(self, variant: str, seed: int) -> Recording:
-        """Return it with a fault."""
-        return self.fault(variant).applied(_with_faults(self.given, seed), seed)
+    def _whole(self) -> Recording:
+        return open_recording(self.given) if isinstance(self.given, Path) else self.given
 
 
 def _with_faults(recording: Recording, seed: int) -> Recording:
@@ -309,7 +294,7 @@ def find_source(
     if kind.comparison:
         made: RecordSource = call(kind.comparison, str(text), folder, selection)
         return made
-    return LogFile(path.stem, path, selection, added=added)
+    return GivenRecord(path.stem, path, selection, added=added)
 
 
 def variants_of(source: RecordSource, asked: str | Iterable[str] | None) -> tuple[str, ...]:

