@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import os
 import re
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -48,19 +46,6 @@ def test_rates_are_of_the_work_done(workers: Workers) -> None:
         assert result.agent_steps_per_s == pytest.approx(2 * result.env_steps_per_s)
         assert result.vehicle_ticks_per_s == pytest.approx(5 * result.env_steps_per_s)
         assert result.cores_used == pytest.approx(SHARE)
-
-
-def test_a_row_is_plain_data_with_the_keys_that_readers_rely_on(workers: Workers) -> None:
-    row = json.loads(json.dumps(measure([fake_case(bytes=60 << 20)], workers, 0.01, 1)[0].row()))
-    expected = {"name": "fake", "worlds": 3, "vehicles": 2, "threads": 1, "dtype": "float64"}
-    assert {key: row[key] for key in expected} == expected
-    for key in ("env_steps_per_s", "agent_steps_per_s", "vehicle_ticks_per_s"):
-        assert row[key] > 0
-    assert row["counted_as_vehicle_ticks"] == "scans"
-    assert [row["slowest_round"], row["fastest_round"]] == pytest.approx([1.0, 1.0])
-    assert row["array_bytes_per_world"] == 20 << 20
-    if sys.platform == "linux":
-        assert row["rss_bytes_per_world"] == pytest.approx(20 << 20, rel=0.2)
 
 
 def test_a_case_that_fails_leaves_the_others_alone(workers: Workers) -> None:
@@ -171,30 +156,6 @@ def test_like_stands_against_like(results: list[Result]) -> None:
 # The command
 
 
-KEYS = {
-    "": {"command", "rows", "machine", "versions", "without_figures", "ratios", "startup_s", "growth"},
-    "rows": {
-        *("name", "worlds", "vehicles", "threads", "dtype", "env_steps_per_s", "agent_steps_per_s"),
-        *("vehicle_ticks_per_s", "counted_as_vehicle_ticks", "array_bytes_per_world", "rss_bytes_per_world"),
-    },
-    "machine": {"processor", "cores_available", "memory_bytes", "system"},
-    "versions": {"python", "coopenv", "warp-lang", "numpy"},
-    "without_figures": {"name", "worlds", "reason"},
-    "ratios": {"peer", "worlds", "threads", "agent_steps"},
-    "startup_s": {"imports", "compiling", "cached"},
-    "growth": {"sizes", "costs", "overall", "large", "label"},
-}
-
-
-def check(document: dict[str, Any]) -> None:
-    """Find the keys that readers rely on."""
-    for part, keys in KEYS.items():
-        found = document[part] if part else document
-        assert all(keys <= set(entry) for entry in (found if isinstance(found, list) else [found])), part
-    assert document["command"].startswith("python -m benchmarks.speed ") and document["rows"]
-    assert all(row["env_steps_per_s"] > 0 for row in document["rows"])
-
-
 @pytest.fixture(autouse=True)
 def terminal(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("COLUMNS", "80")
@@ -211,7 +172,8 @@ def test_a_run_with_a_fake_peer(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     out = capsys.readouterr().out
     assert max(len(line) for line in out.splitlines()) <= 80 and "…" not in out
     document = json.loads(Path("here/speed.json").read_text())
-    check(document)
+    assert document["command"].startswith("python -m benchmarks.speed ")
+    assert all(row["env_steps_per_s"] > 0 for row in document["rows"])
     assert [row["name"] for row in document["rows"]] == ["make_vec", "fake"]
     assert document["without_figures"][0]["reason"] == "not installed: pip install highway-env"
     assert set(document["startup_s"]["imports"]) == {"coopenv", "fake"}
@@ -229,7 +191,8 @@ def test_quick_from_end_to_end(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(line.split()) == 0
     out = capsys.readouterr().out
     document = json.loads(Path("here/speed.json").read_text())
-    check(document)
+    assert document["command"].startswith("python -m benchmarks.speed ")
+    assert all(row["env_steps_per_s"] > 0 for row in document["rows"])
     assert max(len(line) for line in out.splitlines()) <= 80
     assert "…" not in out
     assert {path.name for path in Path("here").iterdir()} == {"speed.json", "speed.png", "growth.png"}

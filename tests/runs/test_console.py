@@ -23,12 +23,10 @@ from coopenv.cli.app import main
 from coopenv.estimation import compiled
 from coopenv.report.terminal import Terminal
 from coopenv.runs import console as module
-from coopenv.runs import scenario_text as words
 from coopenv.runs.console import Progress, compile_notice, note_overwritten
 from coopenv.runs.scenario_text import IMAGE_FIELDS, settings
 from coopenv.runs.summary import describe_scenario
 from coopenv.scenario import parse_scenario
-from coopenv.scenario.bodies import SegmentMotion, WaypointMotion
 from coopenv.scenario.files import apply_vehicle_defaults, schema_text
 from coopenv.world import launch
 from tests.helpers.commands import printed
@@ -226,28 +224,6 @@ def test_settings_of_the_image_are_left_out_where_there_is_none() -> None:
     assert {"model", "position", "orientation", "miss_probability"} <= set(keys["busy_intersection"])
     assert set(IMAGE_FIELDS) <= set(keys["crossing_path"])
     assert "principal_point" not in described("busy_intersection", 100)
-
-
-def test_stages_of_prescribed_motions_are_shown() -> None:
-    lines = [line.split() for line in described("crossing_path", 80).splitlines()]
-    first = lines.index(["vehicle_1", "0-20", "rests"])
-    assert lines[first + 1 : first + 5] == [
-        ["20-22.1", "0.26", "m/s", "forward"],
-        ["22.1-28.5", "rests"],
-        ["28.5-30", "0.26", "m/s", "forward"],
-        ["30-", "rests"],
-    ]
-    assert ["ML", "0-15.6", "rests"] in lines
-    assert "Stages of motion" not in described("busy_intersection", 80)
-    turning = {"duration": 2.5, "linear": (0.26, 0, 0), "angular": (0, 0, -0.5)}
-    segments = SegmentMotion.model_validate({"kind": "segments", "segments": [turning]})
-    assert list(words.stages(segments)) == [
-        ("0-2.5", "0.26 m/s forward, turning at (0, 0, -0.5) rad/s"),
-        ("2.5-", "rests"),
-    ]
-    waypoints = [{"time": 0.0, "position": (0, 0, 0)}, {"time": 8.0, "position": (4, 0, 1.5)}]
-    spline = WaypointMotion.model_validate({"kind": "waypoints", "waypoints": waypoints})
-    assert list(words.stages(spline)) == [("0", "at (0, 0, 0)"), ("8", "at (4, 0, 1.5)")]
 
 
 def test_overrides_are_described(capsys: pytest.CaptureFixture[str]) -> None:

@@ -258,27 +258,35 @@ def test_bearings_are_swapped_within_their_frame() -> None:
         assert before == now
 
 
-def test_a_gyro_is_biased_from_its_step_on() -> None:
-    """The increments turn by the bias as well."""
-    after = changed_by("vehicle_2:gyro_step=0.3@1")
-    difference = after.angular_velocity - made().angular_velocity
-    late = made().t >= 1.0 - 1e-9
-    assert_allclose(difference[late, 1], np.broadcast_to([0.0, 0.0, 0.3], (late.sum(), 3)), atol=1e-12)
-    assert not difference[~late].any() and not np.delete(difference, 1, axis=1).any()
-    turned = made().rotation[late, 1].swapaxes(-1, -2) @ after.rotation[late, 1]
-    assert_allclose(np.arctan2(turned[:, 1, 0], turned[:, 0, 0]), 0.3 * made().dt, atol=1e-12)
-    assert differing(after, made()) == {"angular_velocity", "rotation"}
-
-
-def test_a_camera_turns_at_its_step() -> None:
-    """To the left, so that its bearings turn to the right."""
-    after = changed_by("vehicle_2:camera_step=0.3@1")
-    late = made().t >= 1.0 - 1e-9
-    turned = Rotation.from_euler("z", -0.3).apply(made().bearings[late, 1].reshape(-1, 3))
-    assert_allclose(after.bearings[late, 1].reshape(-1, 3), turned, atol=1e-12)
-    assert_array_equal(after.bearings[~late], made().bearings[~late])
-    assert_array_equal(np.delete(after.bearings, 1, axis=1), np.delete(made().bearings, 1, axis=1))
-    assert differing(after, made()) == {"bearings"}
+@pytest.mark.parametrize(
+    ("fault", "arrays"),
+    [
+        ("gyro_step=0.3", {"angular_velocity", "rotation"}),
+        ("camera_step=0.3", {"bearings"}),
+        ("focal_step=0.1", {"bearings"}),
+    ],
+)
+def test_a_step_changes_its_vehicle_from_its_time_on(fault: str, arrays: set[str]) -> None:
+    """A gyro's increments turn by the bias; a camera turns left; tangents to the optical axis grow by the share."""
+    after, late, dt = changed_by(f"vehicle_2:{fault}@1"), made().t >= 1.0 - 1e-9, made().dt
+    assert differing(after, made()) == arrays
+    for name in arrays:
+        assert_array_equal(getattr(after, name)[~late], getattr(made(), name)[~late])
+        assert_array_equal(*(np.delete(getattr(r, name), 1, axis=1) for r in (after, made())))
+    before, now = made().bearings[late, 1], after.bearings[late, 1]
+    if fault.startswith("gyro"):
+        difference = (after.angular_velocity - made().angular_velocity)[late, 1]
+        assert_allclose(difference, np.broadcast_to([0.0, 0.0, 0.3], difference.shape), atol=1e-12)
+        turned = made().rotation[late, 1].swapaxes(-1, -2) @ after.rotation[late, 1]
+        assert_allclose(np.arctan2(turned[:, 1, 0], turned[:, 0, 0]), 0.3 * dt, atol=1e-12)
+    elif fault.startswith("camera"):
+        turned = Rotation.from_euler("z", -0.3).apply(before.reshape(-1, 3))
+        assert_allclose(now.reshape(-1, 3), turned, atol=1e-12)
+    else:
+        along, along_now = (bearings @ np.array(made().setups[1].optical_axis) for bearings in (before, now))
+        tangents, tangents_now = (np.sqrt(1.0 - share**2) / share for share in (along, along_now))
+        assert_allclose(tangents_now, 1.1 * tangents, rtol=1e-9)
+        assert_allclose(np.linalg.norm(now[np.isfinite(now[..., 0])], axis=-1), 1.0)
 
 
 def test_initial_estimates_are_off() -> None:
@@ -288,23 +296,6 @@ def test_initial_estimates_are_off() -> None:
     given = changed_by("prior_error=2,angle=0")
     assert_allclose(given.start_position - made().start_position, np.tile([2.0, 0.0, 0.0], (len(shift), 1)), atol=1e-12)
     assert differing(given, made()) == {"start_position"}
-
-
-def test_a_focal_length_is_too_large_from_its_step_on() -> None:
-    """The tangent of the angle to the optical axis grows by that share."""
-    after, axis = changed_by("vehicle_2:focal_step=0.1@1"), made().setups[1].optical_axis
-    late = made().t >= 1.0 - 1e-9
-
-    def tangents(bearings: np.ndarray) -> np.ndarray:
-        along = bearings @ np.array(axis)
-        return np.asarray(np.sqrt(1.0 - along**2) / along)
-
-    assert_allclose(tangents(after.bearings[late, 1]), 1.1 * tangents(made().bearings[late, 1]), rtol=1e-9)
-    seen = np.isfinite(after.bearings[late, 1, :, 0])
-    assert_allclose(np.linalg.norm(after.bearings[late, 1][seen], axis=-1), 1.0)
-    assert_array_equal(after.bearings[~late], made().bearings[~late])
-    assert_array_equal(np.delete(after.bearings, 1, axis=1), np.delete(made().bearings, 1, axis=1))
-    assert differing(after, made()) == {"bearings"}
 
 
 def test_the_scale_error_grows_to_its_value() -> None:
