@@ -28,6 +28,7 @@ from coopenv.base.files import check_file, new_folder, replacing_file, replacing
 from coopenv.evaluation import Result, drive, held_out_seeds, ranking_key, score
 from coopenv.policies import Policy, load_agent
 from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE, check_agent
+from coopenv.policies.network import RightOfWay
 from coopenv.scenario import Scenario
 from coopenv.sources.sources import open_simulation
 from coopenv.training.export import EXPORTED, check_onnx, export
@@ -97,7 +98,7 @@ def possible(plan: TrainingPlan) -> Scenario:
 
     Raises:
         CoopenvError: no vehicle is driven there, a variation is not possible, a driver of the ranking is unknown, or
-            the driver to begin as lacks what it needs to see.
+            the driver to begin as, or the right of way, lacks what it needs to see.
     """
     scenario = open_simulation(plan.environment, plan.all_overrides)
     if not any(scenario.acting):
@@ -106,6 +107,11 @@ def possible(plan: TrainingPlan) -> Scenario:
         tensors_of(plan.settings.start, scenario)
     for name in plan.settings.evaluation.drivers:
         check_agent(name, "driver (evaluation.drivers)")
+    if plan.settings.right_of_way:
+        try:
+            RightOfWay(scenario)
+        except ValueError as error:
+            raise CoopenvError(f"right_of_way: {error}") from None
     for own in plan.watched():
         try:
             for each, _ in own.scenarios():
