@@ -28,7 +28,7 @@ from coopenv.estimation.poses import (
 )
 from coopenv.observers.arrays import ARRAYS, KINDS_OF_TICKS, invalid_rows, misshapen, sizes_of
 from coopenv.observers.contract import Gains, ObserverInit, Received, SensorNoise, Setup, Tick, sealed
-from coopenv.scenario.learning import MOST, PARAMETERS
+from coopenv.scenario.difficulty import MOST, PARAMETERS
 from coopenv.scenario.schema import neighbour_sets, processing_order
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ class Drawn:
 
     key: int  # of the world's random streams, see `coopenv.base.errors`
     episode: int
-    parameters: tuple[float, ...]  # factors, in the order of `coopenv.scenario.learning.PARAMETERS`
+    parameters: tuple[float, ...]  # factors, in the order of `coopenv.scenario.difficulty.PARAMETERS`
 
 
 @dataclass(frozen=True, kw_only=True)

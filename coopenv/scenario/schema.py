@@ -18,9 +18,11 @@ from coopenv.base.sections import Positive, Section, Text, Vector3, overlaid, va
 from coopenv.base.units import EPISODE, PLACE, TIME, warn_of_implausible
 from coopenv.scenario.bodies import MOST_LANDMARKS, Landmark, LandmarkGroup, Obstacle, Road, Vehicle
 from coopenv.scenario.cosimulators import COSIMULATORS, Cosimulator, Highway, Program, Sumo
-from coopenv.scenario.learning import Action, Difficulty, Dynamics, Observation, Randomisation, Reward, Termination
+from coopenv.scenario.difficulty import Difficulty, Randomisation
+from coopenv.scenario.dynamics import Dynamics
 from coopenv.scenario.routes import Boxes, Route, followers, overlapping_pairs, possible_boxes, start_of
 from coopenv.scenario.sensing import Camera, Faults, Images, Noise, ObserverSettings, Rates, Topology, V2x, rotation_of
+from coopenv.scenario.task import Action, Observation, Reward, Termination
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

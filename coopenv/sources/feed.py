@@ -13,7 +13,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers.recording import MEASURED, Recording, Sensed, Truth
-from coopenv.scenario.learning import PARAMETERS
+from coopenv.scenario.difficulty import PARAMETERS
 from coopenv.world.camera import (
     MISSED,
     OUT_OF_VIEW,

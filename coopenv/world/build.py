@@ -13,7 +13,8 @@ from coopenv.estimation import KINDS, Outcome
 from coopenv.estimation.lens import largest_radius
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Vehicle
-from coopenv.scenario.learning import FASTEST_PACE, PARAMETERS, Dynamics
+from coopenv.scenario.difficulty import FASTEST_PACE, PARAMETERS
+from coopenv.scenario.dynamics import Dynamics
 from coopenv.scenario.routes import Signal, compile_motion, even_points, followers, point_count
 from coopenv.scenario.schema import agent_starts, neighbour_sets, processing_order
 from coopenv.scenario.sensing import Camera, Faults, Noise, Rates, rotation_of

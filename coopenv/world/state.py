@@ -31,7 +31,7 @@ from coopenv.estimation.poses import (
     are_unit_vectors,
     everywhere,
 )
-from coopenv.scenario.learning import MOST, PARAMETERS
+from coopenv.scenario.difficulty import MOST, PARAMETERS
 from coopenv.world.model import Precision
 from coopenv.world.warp_internals import field_types, struct_of
 

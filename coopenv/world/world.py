@@ -12,7 +12,7 @@ from coopenv.base.errors import CoopenvError, ScenarioWarning, check_memory
 from coopenv.estimation import UNKNOWN, Sight
 from coopenv.estimation.poses import Rule
 from coopenv.scenario import Scenario
-from coopenv.scenario.learning import PARAMETERS
+from coopenv.scenario.difficulty import PARAMETERS
 from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
 from coopenv.world.launch import VEHICLES_PER_LEVEL, Call, Launcher, PerLane, PerWorld, threads_and_lanes

@@ -15,7 +15,7 @@ from coopenv.policies.single_vehicle import SingleVehicleEnv
 from coopenv.runs import Rollout
 from coopenv.runs.rollouts import outcome_line
 from coopenv.scenario import Scenario
-from coopenv.scenario.learning import PARAMETERS
+from coopenv.scenario.difficulty import PARAMETERS
 from tests.helpers.builders import constant, landmark, scenario, vehicle
 from tests.helpers.four_way import FOUR_WAY
 

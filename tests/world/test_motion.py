@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import Outcome
-from coopenv.scenario.learning import FASTEST_PACE
+from coopenv.scenario.difficulty import FASTEST_PACE
 from coopenv.scenario.routes import Boxes
 from coopenv.world import dynamics
 from coopenv.world.build import _motion
