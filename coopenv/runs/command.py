@@ -20,7 +20,8 @@ from coopenv.base.format import json_text
 from coopenv.base.installation import install_command
 from coopenv.base.terminal import Terminal, text_of
 from coopenv.estimation.metrics import shown_note, shown_vehicles, steady_start
-from coopenv.estimation.observability import Observability, Trajectory, analyse_observability
+from coopenv.estimation.observability import Observability, analyse_observability
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import states_covariance, with_observer
 from coopenv.policies import Policy

@@ -25,8 +25,9 @@ from coopenv.estimation.metrics import (
     relative_error,
     settling_time,
 )
-from coopenv.estimation.observability import RecordedGeometry, analyse_observability
+from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.poses import Array
+from coopenv.estimation.trajectory import RecordedGeometry
 from coopenv.observers.bound import Bound, cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Factory
 from coopenv.observers.isolation import started
