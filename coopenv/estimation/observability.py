@@ -39,7 +39,6 @@ from coopenv.estimation.poses import Array, skew
 from coopenv.estimation.trajectory import RecordedGeometry
 from coopenv.estimation.trajectory import Trajectory as Trajectory  # until 0.10 here, too
 
-
 DEFAULT_WINDOW = 1.0
 DEFAULT_THRESHOLD = 1e-4
 

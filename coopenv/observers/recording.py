@@ -15,17 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, shown
 from coopenv.base.sections import LARGEST
-from coopenv.estimation.poses import (
-    MISFIT_DEG,
-    Array,
-    Mask,
-    are_numbers,
-    are_unit_vectors,
-    bearing_misfit_deg,
-    everywhere,
-    exp_so3,
-    exp_translation,
-)
+from coopenv.estimation.poses import MISFIT_DEG, Array, bearing_misfit_deg, exp_so3, exp_translation
+from coopenv.estimation.validity import Mask, are_numbers, are_unit_vectors, everywhere
 from coopenv.observers.arrays import ARRAYS, KINDS_OF_TICKS, invalid_rows, misshapen, sizes_of
 from coopenv.observers.contract import Gains, ObserverInit, Received, SensorNoise, Setup, Tick, sealed
 from coopenv.scenario.difficulty import MOST, PARAMETERS

@@ -15,7 +15,8 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, check_one_of
-from coopenv.estimation.poses import Array, are_numbers, are_rotations
+from coopenv.estimation.poses import Array
+from coopenv.estimation.validity import are_numbers, are_rotations
 from coopenv.observers.contract import Message, ObserverInit, check_message
 from coopenv.observers.recording import Sensed
 from coopenv.observers.runner import observer_init_of

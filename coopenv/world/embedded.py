@@ -11,7 +11,8 @@ from typing import Any
 import warp as wp
 
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.poses import Coordinates, Rule
+from coopenv.estimation.poses import Coordinates
+from coopenv.estimation.validity import Rule
 from coopenv.world.camera import observe
 from coopenv.world.dynamics import depart, move, move_landmarks, referee
 from coopenv.world.model import Precision

@@ -10,7 +10,7 @@ import warp as wp
 
 from coopenv.base.errors import CoopenvError, ScenarioWarning, check_memory
 from coopenv.estimation import UNKNOWN, Sight
-from coopenv.estimation.poses import Rule
+from coopenv.estimation.validity import Rule
 from coopenv.scenario import Scenario
 from coopenv.scenario.difficulty import PARAMETERS
 from coopenv.world.build import build_model
