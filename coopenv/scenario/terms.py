@@ -329,5 +329,5 @@ REWARD_TERMS = Registry(
 )
 TERMINATION_CONDITIONS = Registry(
     "termination condition",
-    {name: Term(function=f"coopenv.world.dynamics:{place}", meaning=about) for name, place, about in CONDITIONS},
+    {name: Term(function=f"coopenv.world.referee:{place}", meaning=about) for name, place, about in CONDITIONS},
 )

@@ -14,10 +14,11 @@ from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Coordinates
 from coopenv.estimation.validity import Rule
 from coopenv.world.camera import observe
-from coopenv.world.dynamics import depart, move, move_landmarks, referee
+from coopenv.world.dynamics import move, move_landmarks
 from coopenv.world.model import Precision
 from coopenv.world.nearby import sort_into_cells
 from coopenv.world.odometry import measure_odometry
+from coopenv.world.referee import depart, referee
 from coopenv.world.reset import begin_sensing, place_bodies
 from coopenv.world.route import appear, direct_traffic
 from coopenv.world.v2x import transmit

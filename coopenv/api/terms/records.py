@@ -12,7 +12,7 @@ clips them, or weighs them.
 import warp as wp
 
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
-from coopenv.world.dynamics import COLLIDED, OFF_ROUTE
+from coopenv.world.referee import COLLIDED, OFF_ROUTE
 
 LOG10_E = wp.constant(0.4342944819032518)
 FORESIGHT = wp.constant(6.0)
