@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import coopenv
-from coopenv.base.errors import MAX_MESSAGE, CoopenvError, DataError, check_memory, shown, training_seed, world_keys
+from coopenv.base.errors import MAX_MESSAGE, CoopenvError, DataError, check_memory, shown
 from coopenv.base.format import (
     column,
     fixed,
@@ -28,6 +28,7 @@ from coopenv.base.format import (
     seconds,
     with_error,
 )
+from coopenv.base.seeds import training_seed, world_keys
 from coopenv.base.terminal import NumberTable, text_of
 
 

@@ -19,12 +19,13 @@ from coopenv.api.terms.layout import Layout, observation_layout
 from coopenv.api.terms.own import OwnTerms
 from coopenv.api.terms.results import MEMORY, results_struct, results_table, step_results, team_results
 from coopenv.base.columns import facts_html, one_line, picture_html
-from coopenv.base.errors import CoopenvError, Explained, check_memory, error_text, training_seed, world_keys
+from coopenv.base.errors import CoopenvError, Explained, check_memory, error_text
 from coopenv.base.installation import load_reference
+from coopenv.base.seeds import training_seed, world_keys
 from coopenv.estimation.poses import Coordinates, riccati_covariance
 from coopenv.observers.contract import Estimate
+from coopenv.observers.faults import Interference, interference_of
 from coopenv.observers.group import ObserverError, ObserverGroup
-from coopenv.observers.mailbox import Interference, interference_of
 from coopenv.observers.recording import Sensed
 from coopenv.observers.registry import find, states_covariance
 from coopenv.scenario import Scenario

@@ -28,7 +28,8 @@ from coopenv.observers.contract import (
     check_estimate,
     check_message,
 )
-from coopenv.observers.mailbox import Interference, Mailbox, altered
+from coopenv.observers.faults import Interference, altered
+from coopenv.observers.mailbox import Mailbox
 from coopenv.observers.recording import Sensed
 
 

@@ -23,7 +23,7 @@ from coopenv.scenario.difficulty import MOST, PARAMETERS
 from coopenv.scenario.schema import neighbour_sets, processing_order
 
 if TYPE_CHECKING:
-    from coopenv.observers.mailbox import Interference
+    from coopenv.observers.faults import Interference
     from coopenv.scenario import Scenario
 
 
@@ -107,7 +107,7 @@ class Sensed(Measurements):
 class Drawn:
     """The keys of the draws of a simulated episode: presence, routes and goals."""
 
-    key: int  # of the world's random streams, see `coopenv.base.errors`
+    key: int  # of the world's random streams, see `coopenv.base.seeds`
     episode: int
     parameters: tuple[float, ...]  # factors, in the order of `coopenv.scenario.difficulty.PARAMETERS`
 

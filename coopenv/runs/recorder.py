@@ -20,7 +20,7 @@ from coopenv.base.installation import environment, install_command, needing, ver
 from coopenv.estimation.poses import quaternion_wxyz
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.evaluation.episodes import Views, play
-from coopenv.observers.mailbox import Interference, interference_of, stacked
+from coopenv.observers.faults import Interference, interference_of, stacked
 from coopenv.observers.recording import MEASURED, Drawn, Recording, Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
 from coopenv.scenario import Scenario, ScenarioLike

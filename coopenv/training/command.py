@@ -23,8 +23,9 @@ from stable_baselines3.common.logger import configure
 
 from coopenv.api.engine import Engine
 from coopenv.base import interrupts
-from coopenv.base.errors import CoopenvError, OutputError, evaluation_seed
+from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import check_file, new_folder, replacing_file, replacing_folder, writing
+from coopenv.base.seeds import evaluation_seed
 from coopenv.evaluation import Result, drive, held_out_seeds, ranking_key, score
 from coopenv.policies import Policy, load_agent
 from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE

@@ -65,7 +65,7 @@ Options = Mapping[str, Any] | None
 class World:
     """`worlds` copies of one scenario, stepped together.
 
-    The draws of a world depend on its key alone (`coopenv.base.errors`): it is bit for bit the single world with that
+    The draws of a world depend on its key alone (`coopenv.base.seeds`): it is bit for bit the single world with that
     key (on the same device).
     """
 

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation import REPLAY
 from coopenv.observers.contract import Message, Received
-from coopenv.observers.mailbox import MOST_CONTENTS, Interference, Mailbox, altered, interference_of, stacked
+from coopenv.observers.faults import Interference, altered, interference_of, stacked
+from coopenv.observers.mailbox import MOST_CONTENTS, Mailbox
 from tests.helpers import builders
 
 DT = 0.1

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from coopenv.base.errors import evaluation_seed
+from coopenv.base.seeds import evaluation_seed
 from coopenv.estimation import Sight
 from coopenv.scenario import Scenario
 from coopenv.scenario.difficulty import PARAMETERS
