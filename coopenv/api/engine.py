@@ -26,8 +26,8 @@ from coopenv.estimation.poses import Coordinates, riccati_covariance
 from coopenv.observers.contract import Estimate
 from coopenv.observers.faults import Interference, interference_of
 from coopenv.observers.group import ObserverError, ObserverGroup
-from coopenv.observers.recording import Sensed
 from coopenv.observers.registry import find, states_covariance
+from coopenv.observers.sensed import Sensed
 from coopenv.scenario import Scenario
 from coopenv.sources.base import Backend, SensingWorld
 from coopenv.sources.sources import simulation_of

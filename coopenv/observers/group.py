@@ -30,7 +30,7 @@ from coopenv.observers.contract import (
 )
 from coopenv.observers.faults import Interference, altered
 from coopenv.observers.mailbox import Mailbox
-from coopenv.observers.recording import Sensed
+from coopenv.observers.sensed import Sensed
 
 
 class ObserverError(CoopenvError):

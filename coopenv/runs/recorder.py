@@ -21,7 +21,8 @@ from coopenv.estimation.poses import quaternion_wxyz
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.evaluation.episodes import Views, play
 from coopenv.observers.faults import Interference, interference_of, stacked
-from coopenv.observers.recording import MEASURED, Drawn, Recording, Sensed, Truth, is_due
+from coopenv.observers.recording import Drawn, Recording
+from coopenv.observers.sensed import MEASURED, Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
 from coopenv.scenario import Scenario, ScenarioLike
 from coopenv.sources.base import Backend

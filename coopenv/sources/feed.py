@@ -12,7 +12,8 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from coopenv.observers.recording import MEASURED, Recording, Sensed, Truth
+from coopenv.observers.recording import Recording
+from coopenv.observers.sensed import MEASURED, Sensed, Truth
 from coopenv.scenario.difficulty import PARAMETERS
 from coopenv.world.camera import MISSED, OUT_OF_VIEW, VISIBLE, camera_to_body, marker_position, sight_of
 from coopenv.world.dynamics import move

@@ -31,8 +31,9 @@ from coopenv.estimation.trajectory import RecordedGeometry
 from coopenv.observers.bound import Bound, cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Factory
 from coopenv.observers.isolation import started
-from coopenv.observers.recording import Recording, Truth
+from coopenv.observers.recording import Recording
 from coopenv.observers.runner import PLANAR_STATES, Run, run
+from coopenv.observers.sensed import Truth
 
 STEADY = "steady"
 
