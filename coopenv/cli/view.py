@@ -202,8 +202,7 @@ def film(given: FilmOptions) -> None:
     options.console().print(f"{out}: {pictures} pictures, {pictures / rate:.3g} s, {size:.2g} MB", soft_wrap=True)
 
 
-CARS = "svea"
-"""The source that stands for the cars of a deployment."""
+watched = arguments.late("coopenv.sources.registry:watched")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,7 +216,7 @@ class ViewOptions(SceneOptions):
             help="Environment (name or TOML file), a log file, a ROS bag, recorded robots (mrclam_1 .. mrclam_9), the "
             "folder of a run, or svea: the cars of --deployment.",
             autocompletion=arguments.environments,
-            callback=lambda name: name if name == CARS else arguments.known_source(name),
+            callback=lambda name: name if name in watched() else arguments.known_source(name),
         ),
     ]
     vehicle: Annotated[str | None, typer.Option(help="Vehicle to look at first, vehicle_1 or f1.")] = None
@@ -233,13 +232,15 @@ class ViewOptions(SceneOptions):
 
     def open(self, more: Mapping[str, Any] | None = None) -> "Backend":
         """Return the source of ticks, cars included."""
-        if self.environment != CARS or self.deployment is None:
+        if self.environment not in watched() or self.deployment is None:
             return super().open(more)
         from coopenv.sources.sources import open_backend
 
         watching = {} if self.observer is None else {"observer.name": self.observer}
         changes = {**self.changes, **watching, **(more or {})}
-        return open_backend(self.deployment, CARS, changes, options={"connect": self.connect, "watch": True})
+        return open_backend(
+            self.deployment, self.environment, changes, options={"connect": self.connect, "watch": True}
+        )
 
     def reel(self) -> "Reel":
         """Return the source of frames; cars are observed and not driven.
@@ -250,15 +251,19 @@ class ViewOptions(SceneOptions):
         from coopenv.runs.live import EngineReel, Reel
         from coopenv.runs.scenes import title_of
 
-        if self.environment == CARS:
+        if self.environment in watched():
             if self.deployment is None:
-                raise CoopenvError("--deployment: needed by coopenv view svea, the deployment file of the cars")
+                raise CoopenvError(
+                    f"--deployment: needed by coopenv view {self.environment}, the deployment file of the cars"
+                )
             if self.agent is not None:
-                raise CoopenvError("--agent: is for a simulation; coopenv svea run --arm lets an agent drive cars")
+                raise CoopenvError(
+                    f"--agent: is for a simulation; coopenv {self.environment} run --arm lets an agent drive cars"
+                )
             return EngineReel(self.open, self.deployment.stem, self.seed, lambda scenario: (None, ""))
         for option, value in (("--deployment", self.deployment), ("--connect", self.connect)):
             if value is not None:
-                raise CoopenvError(f"{option} {value}: is for coopenv view svea")
+                raise CoopenvError(f"{option} {value}: is for coopenv view {' or '.join(watched())}")
         saved = self.saved()
         return (
             EngineReel(self.open, title_of(self.environment), self.seed, self.driver)
