@@ -31,11 +31,12 @@ from coopenv.policies import Policy, load_agent
 from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE
 from coopenv.scenario import Scenario
 from coopenv.sources.sources import open_simulation
+from coopenv.training.batches import Arrays
 from coopenv.training.export import EXPORTED, check_onnx, export
 from coopenv.training.ranking import Figures, Ranking, figures_of
 from coopenv.training.sets import SetTrainer
 from coopenv.training.settings import TrainingPlan, check_settings, environment_file
-from coopenv.training.trainer import Arrays, DivergedError, Status, Trainer, tensors_of
+from coopenv.training.trainer import DivergedError, Status, Trainer, tensors_of
 
 NAMES = (*EXPORTED, CHECKPOINT_FILE, *CARD_FILES)
 """Names of files in an agent's folder; a card belongs to a single agent, and is removed with it."""
