@@ -1,4 +1,4 @@
-"""How a car moves under a command."""
+"""The motion of a car under a command."""
 
 from typing import Annotated, Self
 
