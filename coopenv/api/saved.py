@@ -1,4 +1,4 @@
-"""The common base of all environments of an engine: layout, text and picture, and states that are saved and restored."""
+"""The common base of all environments of an engine: layout, text, picture, and states that are saved and restored."""
 
 from __future__ import annotations
 
