@@ -18,6 +18,7 @@ ROOMS = (
     ("observers",),
     ("sources", "backends"),
     ("viz",),
+    ("policies.base",),
     ("api",),
     ("policies",),
     ("evaluation",),

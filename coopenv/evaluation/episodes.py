@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.base.errors import CoopenvError, evaluation_seed, world_keys
+from coopenv.base.errors import CoopenvError
+from coopenv.base.seeds import evaluation_seed, world_keys
 from coopenv.estimation import Outcome, Sight
 from coopenv.policies import Policy, decide, restart
 from coopenv.scenario import Scenario

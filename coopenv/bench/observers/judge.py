@@ -25,13 +25,15 @@ from coopenv.estimation.metrics import (
     relative_error,
     settling_time,
 )
-from coopenv.estimation.observability import RecordedGeometry, analyse_observability
+from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.poses import Array
+from coopenv.estimation.trajectory import RecordedGeometry
 from coopenv.observers.bound import Bound, cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Factory
 from coopenv.observers.isolation import started
-from coopenv.observers.recording import Recording, Truth
+from coopenv.observers.recording import Recording
 from coopenv.observers.runner import PLANAR_STATES, Run, run
+from coopenv.observers.sensed import Truth
 
 STEADY = "steady"
 
