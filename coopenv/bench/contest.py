@@ -8,7 +8,8 @@ from itertools import groupby
 from typing import Any
 
 from coopenv.api.engine import Engine
-from coopenv.base.errors import ActionError, CoopenvError, checked_seed
+from coopenv.base.errors import ActionError, CoopenvError
+from coopenv.base.seeds import checked_seed
 from coopenv.evaluation import Episodes, drive, held_out_seeds
 from coopenv.policies import Agent, Policy, agents_for, find_agent
 from coopenv.scenario import Scenario, ScenarioLike, scenario_name

@@ -22,7 +22,7 @@ from matplotlib.ticker import NullLocator
 
 from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.base.files import replacing_file
-from coopenv.estimation.observability import Trajectory
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.report.notebook import picture_html
 from coopenv.viz import FORMATS
 

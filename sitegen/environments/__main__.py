@@ -13,7 +13,8 @@ from pathlib import Path
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
 from coopenv.base.installation import list_envs
-from coopenv.cli.options import known_environment, warned
+from coopenv.cli.arguments import known_environment
+from coopenv.cli.options import warned
 from coopenv.report.terminal import Terminal
 from coopenv.runs.console import Progress
 from coopenv.sources.sources import open_simulation

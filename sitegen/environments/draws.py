@@ -9,7 +9,7 @@ import numpy as np
 from coopenv.base.errors import listed
 from coopenv.base.format import number
 from coopenv.scenario.bodies import DrivenMotion
-from coopenv.scenario.learning import PARAMETERS
+from coopenv.scenario.difficulty import PARAMETERS
 from coopenv.scenario.schema import Scenario
 
 

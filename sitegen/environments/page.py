@@ -8,10 +8,10 @@ from PIL import Image
 
 from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import observation_layout
-from coopenv.base.errors import world_keys
 from coopenv.base.files import check_file, replace_text, replacing_file, writing
 from coopenv.base.format import number
 from coopenv.base.installation import environment_id, list_envs
+from coopenv.base.seeds import world_keys
 from coopenv.report.table import Column, Table, bullets, markdown, plain
 from coopenv.runs import scenario_text
 from coopenv.runs.summary import environment_rows, facts, shown_sections

@@ -18,7 +18,7 @@ import coopenv
 from coopenv.base.installation import load_reference
 from coopenv.bench.evaluation import KINDS
 from coopenv.cli.app import main
-from coopenv.estimation.observability import Trajectory
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.command import Results
 from tests.helpers.four_way import FOUR_WAY
 

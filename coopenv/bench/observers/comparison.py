@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
 
-from coopenv.base.errors import CoopenvError, DataWarning, check_one_of, checked_seed, explained
+from coopenv.base.errors import CoopenvError, DataWarning, check_one_of, explained
 from coopenv.base.installation import names_of
+from coopenv.base.seeds import checked_seed
 from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables
 from coopenv.bench.observers.judge import JudgedRun, Task, judge_all
