@@ -15,6 +15,8 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+from tests.helpers.cpu_time import CpuTime
+
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 os.environ.setdefault("MPLBACKEND", "Agg")
 # Small matrices: more BLAS threads only get in each other's way. Read when NumPy is loaded, so not in a fixture.
@@ -65,6 +67,12 @@ def browser() -> Iterator[Any]:
         started = tools.chromium.launch(executable_path=program, args=DRAWS_WITHOUT_A_GRAPHICS_CARD)
         yield started
         started.close()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    costs = CpuTime()
+    costs.measure_compilation()
+    config.pluginmanager.register(costs, "cpu_time")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

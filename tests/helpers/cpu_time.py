@@ -1,0 +1,99 @@
+"""CPU time of tests by wing, which is the top folder of `tests`: printed after each run, and limited in a whole run."""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from collections.abc import Generator
+from functools import wraps
+from typing import Any
+
+import pytest
+
+from coopenv.world import launch
+
+SHOWN = 40
+"""Slowest tests that are listed."""
+LIMITS = {"api": 0.1}
+"""Largest share of each wing in the CPU time of a whole run without compilation, about 1.5 times its present share."""
+COMPILATION = "compilation"
+"""Row of the time in which kernels are compiled or loaded: with an empty cache a quarter of the whole."""
+OTHER = "."
+"""Wing of the files that stand in no folder of `tests`."""
+
+
+def wing_of(test: str) -> str:
+    """Return the wing of a test by its node id, such as `world` for `tests/world/test_camera.py::test_lens`."""
+    folders = test.partition("::")[0].split("/")[1:-1]
+    return folders[0] if folders else OTHER
+
+
+def used() -> float:
+    """Return the CPU time (s) of this process and of its children that have ended."""
+    return sum(os.times()[:4])
+
+
+class CpuTime:
+    """A plugin of pytest: workers measure their tests, the process that controls them adds up, prints and judges."""
+
+    def __init__(self) -> None:
+        self.by_test: dict[str, float] = defaultdict(float)
+        self.compilation = 0.0
+        self._compiling, self._since = 0.0, used()
+
+    def measure_compilation(self) -> None:
+        """Measure from now on the time in which this process loads kernels."""
+        load = launch._launch
+
+        @wraps(load)
+        def measured(*given: Any) -> Any:
+            before = used()
+            try:
+                return load(*given)
+            finally:
+                self._compiling += used() - before
+
+        launch._launch = measured
+
+    def pytest_runtest_logstart(self) -> None:
+        self._since, self._compiling = used(), 0.0
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_makereport(self) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+        report = yield
+        report.user_properties += [("compilation", self._compiling), ("cpu", used() - self._since - self._compiling)]
+        self._since, self._compiling = used(), 0.0
+        return report
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        of = dict(report.user_properties)
+        self.by_test[report.nodeid] += of.get("cpu", 0.0)
+        self.compilation += of.get("compilation", 0.0)
+
+    def by_wing(self) -> dict[str, float]:
+        """Return the CPU time (s) of each wing, the largest first."""
+        sums: dict[str, float] = defaultdict(float)
+        for test, seconds in self.by_test.items():
+            sums[wing_of(test)] += seconds
+        return dict(sorted(sums.items(), key=lambda pair: -pair[1]))
+
+    def excesses(self) -> list[str]:
+        """Return a line for each wing that takes more than its share."""
+        wings = self.by_wing()
+        total = sum(wings.values())
+        return [
+            f"tests/{wing}: {wings[wing] / total:.1%} of the CPU time, more than {limit:.1%}; mend its slowest tests"
+            for wing, limit in LIMITS.items()
+            if wings.get(wing, 0.0) > limit * total
+        ]
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        slowest = sorted(self.by_test.items(), key=lambda pair: -pair[1])[:SHOWN]
+        terminalreporter.section(f"CPU time (s) of the {len(slowest)} slowest tests and of each wing")
+        for test, seconds in slowest:
+            terminalreporter.write_line(f"{seconds:7.2f}  {test}")
+        wings = self.by_wing()
+        total = sum(wings.values())
+        for wing, seconds in wings.items():
+            terminalreporter.write_line(f"{seconds:7.1f}  {seconds / max(total, 1e-9):6.1%}  {wing}")
+        terminalreporter.write_line(f"{self.compilation:7.1f}          {COMPILATION}")
