@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.stats import chi2
 
+from benchmarks.robust.worlds import estimates, nees_of
 from coopenv.api.engine import Engine
 from coopenv.bench.observers.convergence import random_start
 from coopenv.estimation.poses import Coordinates
@@ -26,7 +27,7 @@ from tests.helpers.env_suite import SHIPPED, largest_slow, rest_slow
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import completed, replayed
 from tests.helpers.robust_ticks import OpenRobust
-from tests.helpers.robust_worlds import crowd, estimates, nees_of, small_errors
+from tests.helpers.robust_worlds import crowd, small_errors
 
 STALE = {"v2x.delay": 3, "v2x.loss": 0.4, "v2x.period": 2, "v2x.staleness": 0.2}
 ISOTROPIC = {"noise.bearing.model": "isotropic", "noise.bearing.scale": 0.0029, "horizon": 4.0}

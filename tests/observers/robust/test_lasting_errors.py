@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.robust.studies import judged
+from benchmarks.robust.worlds import estimates, watched
 from coopenv.observers.robust.constants import GYRO_BIAS
 from coopenv.observers.robust.memory import ERRORS, MOUNTING
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.world.world import World
 from tests.helpers.builders import reset, simulate
 from tests.helpers.four_way import FOUR_WAY
-from tests.helpers.robust_worlds import estimates, nees_of, steps_of, watched
 from tests.helpers.warp_calls import DTYPES
 
 Driver = Callable[[World, int, np.ndarray], np.ndarray | float]
@@ -91,13 +92,6 @@ def still(world: World, k: int, phase: np.ndarray) -> float:
     return 0.0
 
 
-def report(name: str, lasting: dict[str, Any], nees: np.ndarray, errors: np.ndarray) -> None:
-    """Print ANEES with its standard error over worlds and the 95th percentile of position errors (`pytest -s`)."""
-    worlds, e95 = np.nanmean(nees, axis=(0, 2)), 100.0 * np.nanpercentile(errors, 95)
-    std = np.nanstd(worlds) / np.sqrt(len(worlds))
-    print(f"\n{name}, {lasting or 'none'}: ANEES {worlds.mean():.2f} +- {std:.2f}, e95 {e95:.0f} cm")
-
-
 def normalised_errors(world: World) -> np.ndarray:
     """Return (W, N, 4) errors of the estimated biases and scale in standard deviations."""
     memory: Any = world.memory
@@ -135,48 +129,12 @@ def test_driven_cars_know_their_errors() -> None:
     assert (normalised_errors(world) ** 2).mean() < 2.0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("lasting", [LASTING, YAW_ONLY, {}])
-def test_a_whole_episode_on_prescribed_paths(lasting: dict[str, Any]) -> None:
-    scenario = load_scenario("busy_intersection_tracking", ROBUST | lasting)
-    nees, errors, _ = driven(scenario, still, 32, "float64", 40)
-    report("tracking from 2 s on", lasting, nees[20:], errors[20:])
-    for part in (nees[20:150], nees[150:]):
-        assert 0.5 < np.nanmean(part) < 1.5
-    assert 0.8 < np.nanmean(nees[350:]) < 1.2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("lasting", [LASTING, {}])
-@pytest.mark.parametrize("agent", ["route_follower", "peek"])
-@pytest.mark.parametrize("environment", ["open_square", "facade", "behind_truck", "urban_crossing"])
-def test_drivers_know_their_errors(environment: str, agent: str, lasting: dict[str, Any]) -> None:
-    scenario = load_scenario(environment, ROBUST | lasting)
-    found = [nees_of(engine.world) for engine in steps_of(agent, scenario, 128, 0)]
-    nees, errors = (np.array(part)[20:] for part in zip(*found, strict=True))
-    known = np.isfinite(nees).sum(axis=0)
-    # By world, so that one that strays until the end counts as the others do; not there at all: NaN.
-    vehicles = np.where(known > 0, np.nansum(nees, axis=0) / np.maximum(known, 1), np.nan)
-    std = np.nanstd(vehicles, axis=0) / np.sqrt((known > 0).sum(axis=0))
-    means = np.nanmean(vehicles, axis=0)
-    summary = ", ".join(f"{mean:.2f} +- {error:.2f}" for mean, error in zip(means, std, strict=True))
-    report(f"{environment}, {agent}, by vehicle {summary}", lasting, nees, errors)
-    assert ((means + 2.0 * std > 0.5) & (means - 2.0 * std < 1.5)).all()
-
-
 TURNED = {"camera.extrinsics_error": 0.01745}  # rad per axis: 1 deg
-
-
-def judged(name: str, seeds: range, start: int, end: int, **overrides: Any) -> tuple[np.ndarray, np.ndarray, World]:
-    """Return (W, N) the mean NEES/6 and error in m of each vehicle from one second to another; and the world."""
-    made = load_scenario(name, {"observer.name": "robust", **TURNED, **overrides})
-    nees, errors, world = watched(made, seeds, end, round(made.rates.camera), skipped=start)
-    return nees.mean(axis=0), errors.mean(axis=0), world
 
 
 def test_it_is_as_sure_as_it_may_be_and_finds_out_how_the_camera_is_turned() -> None:
     """A car that goes straight on tells its heading from the camera's by where its odometry leads."""
-    nees, _, world = judged("busy_intersection_tracking", range(16), 10, 40)
+    nees, _, world = judged("busy_intersection_tracking", range(16), 10, 40, **TURNED)
     assert (nees.mean(axis=0) < 2.5).all()
     R = world.memory.member.numpy()["pose"]["R"][:, 0, MOUNTING]
     turn = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1) / 2
@@ -191,32 +149,10 @@ def test_it_is_as_sure_as_it_may_be_and_finds_out_how_the_camera_is_turned() -> 
 
 def test_a_declared_error_of_the_focal_length_is_estimated() -> None:
     """Of cameras that look ahead."""
-    focal = {"camera.extrinsics_error": 0.0, "camera.focal_length_error": 0.03, "camera.orientation": "forward"}
+    focal = {"camera.focal_length_error": 0.03, "camera.orientation": "forward"}
     nees, error, world = judged("busy_intersection_tracking", range(16), 10, 20, **focal)
     assert (nees.mean(axis=0) < 2.0).all() and error.mean() < 0.2, (nees.mean(axis=0), error.mean(axis=0))
     known, P = world.memory.member.numpy()["v"][..., ERRORS, 1], world.memory.P.numpy()[..., ERRORS, ERRORS, 4, 4]
     wrong = known - world.view("camera_focal")
     assert (np.square(wrong) / P).mean() < 2.0
     assert np.sqrt(np.square(wrong[:, 0]).mean()) < 0.1 * 0.03  # it sees three landmarks
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["busy_intersection_tracking", "lane:8", "tree:15"])
-def test_figures_in_other_worlds(name: str) -> None:
-    seeds = range(700, 732)
-    nees, error, _ = judged(name, seeds, 10, 40)
-    without, good, _ = judged(name, seeds, 10, 40, **{"camera.extrinsics_error": 0.0})
-    print(f"\n{name}: ANEES {_text(nees)}, error cm {_cm(error)}; of a true camera {_text(without)}, {_cm(good)}")
-    assert (nees.mean(axis=0) < 2.5).all()
-
-
-def _text(values: np.ndarray) -> str:
-    return " ".join(f"{m:.2f}({s:.2f})" for m, s in zip(values.mean(axis=0), _error(values), strict=True))
-
-
-def _cm(values: np.ndarray) -> str:
-    return " ".join(f"{100 * m:.1f}" for m in values.mean(axis=0))
-
-
-def _error(values: np.ndarray) -> np.ndarray:
-    return np.asarray(values.std(axis=0, ddof=1) / np.sqrt(len(values)))

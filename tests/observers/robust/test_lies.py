@@ -9,59 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.robust.scenes import HONEST, LIES, with_liars
+from benchmarks.robust.studies import costs
+from benchmarks.robust.worlds import position_errors, started
 from coopenv.observers import Message, run
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
-from tests.helpers.builders import reset, simulate
 from tests.helpers.env_suite import rest_slow
 from tests.helpers.recordings import completed
-from tests.helpers.robust_sources import scene
-from tests.helpers.robust_worlds import position_errors
-
-HONEST = {"odometry": "honest"}
-LIES: dict[str, tuple[tuple[int, ...], dict[str, Any]]] = {
-    "the first from its first word, 5 m": ((0,), {"kind": "jump", **HONEST}),
-    "the second from its first word, 5 m": ((1,), {"kind": "jump", **HONEST}),
-    "the second from 15 s on, 5 m": ((1,), {"kind": "jump", "start": 15.0, **HONEST}),
-    "the second from 15 s on, 5 m, consistent": ((1,), {"kind": "jump", "start": 15.0}),
-    "the second turns by 30 deg from 15 s on": ((1,), {"kind": "jump", "start": 15.0, "offset": 0.0, "turn": 0.52}),
-    "the second drifts at 5 cm/s from 15 s on": ((1,), {"kind": "drift", "start": 15.0, **HONEST}),
-    "the second drifts at 5 cm/s from 15 s on, consistent": ((1,), {"kind": "drift", "start": 15.0}),
-    "the third drifts at 5 cm/s from 15 s on": ((2,), {"kind": "drift", "start": 15.0, **HONEST}),
-    "the second repeats itself 1 s late from 15 s on": ((1,), {"kind": "replay", "start": 15.0}),
-    "the first two collude from 15 s on, 5 m": ((0, 1), {"kind": "collude", "start": 15.0, **HONEST}),
-    "the first two collude from 15 s on, 5 m, consistent": ((0, 1), {"kind": "collude", "start": 15.0}),
-}
-"""Without HONEST, the odometry in messages agrees with the lie."""
-
-
-def mean_errors(made: Scenario, seeds: range, seconds: int, start: float) -> np.ndarray:
-    """Return (W, N) the mean position error of each vehicle from `start` on, m."""
-    world = simulate(made, len(seeds))
-    reset(world, seeds)
-    found = []
-    for k in range(2 * seconds):
-        world.advance(30)
-        if (k + 1) / 2 > start:
-            found.append(position_errors(world))
-    return np.mean(found, axis=0)
-
-
-@cache
-def honest(seeds: range, seconds: int, start: float) -> np.ndarray:
-    """Return the errors in worlds without a lie."""
-    return mean_errors(scene(), seeds, seconds, start)
-
-
-def costs(name: str, seeds: range, seconds: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return (N,) by how much larger errors are with a lie than without, NaN for who lies; (W,) that of their mean."""
-    liars, lie = LIES[name]
-    start = max(lie.get("start", 0.0), 5.0)
-    without = honest(seeds, seconds, start).mean(axis=0)
-    found = mean_errors(scene(liars, **lie), seeds, seconds, start)
-    found[:, list(liars)] = np.nan
-    return found.mean(axis=0) / without, np.nanmean(found, axis=1) / without[~np.isnan(found[0])].mean()
-
 
 MOST = {
     "the second drifts at 5 cm/s from 15 s on, consistent": 9.0,
@@ -72,15 +27,9 @@ MOST = {
 """Where the median over worlds is not below 3."""
 
 
-@pytest.mark.parametrize(
-    ("seeds", "seconds"), [(range(6), 25), pytest.param(range(900, 924), 45, marks=pytest.mark.slow)], ids=str
-)
 @pytest.mark.parametrize("name", rest_slow(LIES, 0, 2, 3, 4, 5, 6, 8, 9, 10))  # not two of one kind
-def test_a_lie_costs_little(name: str, seeds: range, seconds: int) -> None:
-    """In most worlds."""
-    ratio, means = costs(name, seeds, seconds)
-    each = " ".join("-" if np.isnan(r) else f"{r:.2f}" for r in ratio)
-    print(f"\n{name}: {means.mean():.2f}({means.std(ddof=1) / np.sqrt(len(means)):.2f}), each {each}")
+def test_a_lie_costs_little_in_most_worlds(name: str) -> None:
+    _, means = costs(name, range(6), 25)
     assert np.median(means) < MOST.get(name, 3.0), means
 
 
@@ -102,8 +51,7 @@ def test_the_odometry_of_a_consistent_liar_leads_where_its_poses_do(
     faults: dict[str, Any], low: float, high: float
 ) -> None:
     """The dead reckoning of an honest sender, and of messages altered on the way, does not."""
-    world = simulate(scene(overrides={"vehicles.vehicle_2.faults": faults}), 1)
-    reset(world, [5])
+    world = started(with_liars(overrides={"vehicles.vehicle_2.faults": faults}), [5])
     world.advance(60)
     belief, member = world.memory.belief.numpy()[0, 1], world.memory.member.numpy()[0, 1, 0]
     sent = max(world.memory.outbox.numpy()[0, 1], key=lambda report: report["tick"])
@@ -115,8 +63,7 @@ def test_the_odometry_of_a_consistent_liar_leads_where_its_poses_do(
 
 def verdicts(made: Scenario, seed: int, seconds: int) -> tuple[np.ndarray, np.ndarray]:
     """Return (N, N) how often each vehicle has excluded each other one, and (N,) the position errors, m, in the end."""
-    world = simulate(made, 1)
-    reset(world, [seed])
+    world = started(made, [seed])
     world.advance(60 * seconds)
     source, N = world.memory.source.numpy()[0], len(made.vehicles)
     about = (source["target"] - world.model.landmarks)[..., None] == np.arange(N)
@@ -134,7 +81,7 @@ def verdicts(made: Scenario, seed: int, seconds: int) -> tuple[np.ndarray, np.nd
 )
 def test_who_sees_a_liar_excludes_it_and_nobody_else(lie: dict[str, Any], by: list[int]) -> None:
     """But for a sender that the liar has misled, once in a world."""
-    excluded = sum(verdicts(scene((1,), 12.0, **lie), seed, 10)[0] for seed in (400, 401))
+    excluded = sum(verdicts(with_liars((1,), 12.0, **lie), seed, 10)[0] for seed in (400, 401))
     assert (excluded[by, 1] >= 1).all(), excluded
     assert excluded.sum(axis=0)[[0, 2, 3, 4]].max() <= 2, excluded
 
@@ -182,7 +129,7 @@ def test_messages_with_altered_entries_end_no_run(seed: int) -> None:
     assert found.position_error[-60:, 0].max() < 0.2  # who hears nobody is not touched
 
 
-honest_recording = cache(lambda horizon, seed: record(scene(horizon=horizon), seed))
+honest_recording = cache(lambda horizon, seed: record(with_liars(horizon=horizon), seed))
 
 
 def errors_beside(sender: int, start: float, seed: int, horizon: float, altered: bool) -> np.ndarray:
@@ -223,17 +170,3 @@ def test_a_single_absurd_message_makes_nobody_uncertain(what: str) -> None:
     others = found.covariance[recording.t > 4.0][:, [0, 1, 3, 4]]
     assert np.sqrt(np.trace(others[..., 3:, 3:], axis1=-2, axis2=-1)).max() < 0.4
     assert found.position_error[recording.t > 4.0].max() < 0.4
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("start", [0.0, 15.0])
-@pytest.mark.parametrize("sender", range(4))
-def test_what_altered_messages_of_one_sender_cost(sender: int, start: float) -> None:
-    pairs = [[errors_beside(sender, start, seed, 40.0, of) for of in (False, True)] for seed in range(900, 912)]
-    without = np.mean([honest.mean() for honest, _ in pairs])
-    cost = np.array([altered.mean() for _, altered in pairs]) / without
-    worst = max(float(altered.max()) for _, altered in pairs)
-    print(
-        f"\n{sender + 1} from {start:.0f} s: {cost.mean():.2f}({cost.std(ddof=1) / 12**0.5:.2f}), worst {worst:.2f} m"
-    )
-    assert np.median(cost) < 2.0
