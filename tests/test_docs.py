@@ -8,8 +8,6 @@ from __future__ import annotations
 import re
 import runpy
 import shlex
-import subprocess
-import sys
 import tomllib
 from collections.abc import Iterator
 from contextlib import suppress
@@ -21,7 +19,6 @@ import pytest
 import typer
 
 import coopenv
-from coopenv.api.arguments import FIELDS, OTHERS, Step
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.learning import read_study
@@ -62,15 +59,6 @@ def test_every_page_with_programs_is_run() -> None:
     assert {name for name, page in PAGES.items() if python_blocks(page)} == RUN
 
 
-def test_blocks_are_whole_programs(tmp_path: Path) -> None:
-    for name, page in PAGES.items():
-        for number, block in enumerate(python_blocks(page)):
-            (tmp_path / f"{Path(name).stem}_{number}.py").write_text(block, encoding="utf-8")
-    command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select=E9,F", "--no-cache", str(tmp_path)]
-    result = subprocess.run(command, capture_output=True, text=True)
-    assert result.returncode == 0, result.stdout + result.stderr
-
-
 def test_the_page_on_backends(capsys: pytest.CaptureFixture[str]) -> None:
     (program,) = run(DOCS / "backends.md")
     assert "missing=24" in capsys.readouterr().out
@@ -83,12 +71,6 @@ def test_the_page_on_outputs() -> None:
     (program,) = run(DOCS / "outputs.md")
     assert len(program["run"].to_pandas()) == program["run"].trajectory.position_error.size
     assert program["run"].metrics["policy"] == "peek" and list(program["found"]) == ["riccati", "robust"]
-
-
-def test_the_entries_of_a_step_are_listed_in_the_api() -> None:
-    page = (DOCS / "reference" / "api" / "index.md").read_text(encoding="utf-8")
-    assert "::: coopenv.api.arguments.Step\n" in page
-    assert all(f"`{name}`" in str(Step.__doc__) for name in (*FIELDS, *OTHERS))
 
 
 def test_the_programs_on_terms_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -318,14 +300,6 @@ def understand(words: list[str]) -> None:
 def test_commands_are_understood(page: Path) -> None:
     for words in commands(page):
         understand(list(words))
-
-
-def test_mistakes_are_noticed() -> None:
-    with pytest.raises(AssertionError, match="no command runn"):
-        understand(["runn", "crossing_path"])
-    for words in (["run", "crossing_path", "--sed", "3"], ["run"], ["run", "crossing_path", "--seed", "three"]):
-        with pytest.raises(typer.BadParameter.__base__):  # type: ignore[arg-type]
-            understand(words)
 
 
 def test_commands_are_found() -> None:

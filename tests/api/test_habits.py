@@ -186,9 +186,7 @@ def test_a_scenario_is_read_by_dotted_keys_and_lists_them() -> None:
     assert "noise.enabled" in scenario and "enabledd" not in scenario.noise and "vehicles.9" not in scenario
     assert "reward.weights.progress" in scenario and "reward.weights.nosuch" not in scenario
     for attempt in (lambda: scenario["noise.enabledd"], lambda: scenario.noise.enabledd):
-        with pytest.raises(
-            AttributeError, match=r"^'Noise' object has no attribute 'enabledd' \(did you mean 'enabled'\?\); keys: "
-        ):
+        with pytest.raises(AttributeError, match=r"^'Noise' object has no attribute 'enabledd' \(did you mean"):
             attempt()
     with pytest.raises(AttributeError, match=r"'to_toml'; .* returns a changed scenario, model_dump\(\) data$"):
         scenario.to_toml()

@@ -185,10 +185,7 @@ class UnspeakableError(Exception):
         (lambda e: (e.rotation, e.position), "update returned (array("),
         (lambda e: replace(e, position=e.position[None]), "position is not a finite array of shape (3,)"),
         (lambda e: replace(e, position=e.position * np.nan), "position is not a finite array of shape (3,)"),
-        (
-            lambda e: (_ for _ in ()).throw(UnspeakableError()),
-            "UnspeakableError: no message: its text raises ZeroDivisionError",
-        ),
+        (lambda e: (_ for _ in ()).throw(UnspeakableError()), "UnspeakableError: no message: its text raises"),
         (lambda e: (_ for _ in ()).throw(ValueError("\x1b[2J" + "a" * 5000)), "ValueError: \\x1b[2Jaaa"),
         (lambda e: replace(e, nis="small", nis_dof=2), "TypeError"),
     ],

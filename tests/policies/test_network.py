@@ -107,11 +107,7 @@ SLOW = {**WHOLE, "action.longitudinal": "acceleration"}
 @pytest.mark.parametrize(
     ("common", "overrides", "message"),
     [
-        (
-            {},
-            {"observation.position_scale": 7.0},
-            r"another observation: 'estimate_position' had scale 8\.0 and has 7\.0",
-        ),
+        ({}, {"observation.position_scale": 7.0}, r"another observation: 'estimate_position' had scale 8\.0"),
         ({}, {"observation.include": ["odometry", "goal"]}, r"'estimate_position' is not in this environment"),
         ({}, {"dynamics.max_speed": 1.5}, r"another action: 'speed' had high 1\.0 and has 1\.5 here"),
         ({}, {"action.longitudinal": "acceleration"}, r"another action: 'speed' is not in this environment"),
@@ -119,11 +115,7 @@ SLOW = {**WHOLE, "action.longitudinal": "acceleration"}
         (WHOLE, {"observation.route_step": 1.0}, r"another observation\.route_step, 0\.5, and it is 1\.0 here"),
         (WHOLE, {"observer.gramian_window": 2.0}, r"another observer\.gramian_window, 1\.0, and it is 2\.0 here"),
         (WHOLE, {"observer.gramian_distance": 3.0}, r"another observer\.gramian_distance, None, and it is 3\.0 here"),
-        (
-            WHOLE,
-            {"reward.observability_floor": 1e-4},
-            r"another reward\.observability_floor, 1e-05, and it is 0\.0001 here",
-        ),
+        (WHOLE, {"reward.observability_floor": 1e-4}, r"another reward\.observability_floor, 1e-05, and it is 0\.0001"),
         (WHOLE, {"rates.decision": 5.0}, r"another rates\.decision, 10\.0, and it is 5\.0 here"),
         (SLOW, {"dynamics.max_speed": 1.5}, r"another dynamics\.max_speed, 1\.0"),
     ],

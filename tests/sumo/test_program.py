@@ -191,9 +191,7 @@ def test_a_city_that_begins_in_the_morning(city: Path, tmp_path: Path) -> None:
     engine = engine_of(city, sumo__net=str(tmp_path / "city.sumocfg"), sumo__routes=[str(tmp_path / "late.rou.xml")])
     engine.reset([1])
     assert engine.world.scenario.sumo.begin == 25200.0 and poses_of(engine)[:, 3].all()
-    with pytest.raises(
-        CoopenvError, match=r"SUMO has 0 after .*; the first of 1\d\d departs at 25,205 s, .* = 25205, or"
-    ):
+    with pytest.raises(CoopenvError, match=r"SUMO has 0 after .*; the first of 1\d\d departs at 25,205 s, .* = 25205"):
         engine_of(city, sumo__routes=[str(tmp_path / "late.rou.xml")]).reset([1])
 
 

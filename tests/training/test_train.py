@@ -282,10 +282,7 @@ def test_an_environment_that_changed_since(here: Path, capsys: pytest.CaptureFix
         (["train", "overtaking"], "all motion is prescribed or has a driver, there is nothing to learn"),
         (["train", "urban_crossing", "--from", "peek"], "start: peek is no policy that PPO learns"),
         (["train", "urban_crossing", "--from", "facade_quality"], "it was trained with another observation"),
-        (
-            ["train", "urban_crossing", "--agent", "route_follower"],
-            "--agent route_follower: there is no train.toml beside it",
-        ),
+        (["train", "urban_crossing", "--agent", "route_follower"], "--agent route_follower: there is no train.toml"),
         (["train", "urban_crossing", "--agent", "route_follower", "--settings", "train.toml"], "give one of them"),
         (["train", "urban_crossing", "--arm", "x"], "no arm 'x'; known: none"),
     ],
