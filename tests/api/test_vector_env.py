@@ -315,12 +315,6 @@ def test_dict_observations_are_the_flat_ones_by_field() -> None:
             assert np.array_equal(np.concatenate(list(named_infos["final_obs"].values()), axis=1), infos["final_obs"])
 
 
-def test_observer_by_name_and_unknown_words() -> None:
-    assert coopenv.make_vec(FOUR_WAY, num_worlds=1, observer="robust").scenario.observer.name == "robust"
-    with pytest.raises(coopenv.CoopenvError, match="unknown observation 'box'; known: flat, dict"):
-        coopenv.make_vec(FOUR_WAY, num_worlds=1, observation="box")  # type: ignore[arg-type]
-
-
 @pytest.fixture(scope="module")
 def env() -> coopenv.CooperativeLocalisationEnv:
     env = coopenv.parallel_env(FOUR_WAY)

@@ -100,31 +100,12 @@ def test_bad_line_is_named(folder, file, line, text, words):
     assert words in said
 
 
-@pytest.mark.parametrize("cut", [3, 25])
-def test_truncated_file(folder, cut):
-    path = folder / "Robot5_Groundtruth.dat"
-    text = path.read_text().rstrip("\n")
-    path.write_text(text[:-cut])
-    assert f"Robot5_Groundtruth.dat:{len(text.splitlines())}: " in message(folder)
-
-
-def test_last_line_end_may_miss(folder):
-    path = folder / "Robot5_Groundtruth.dat"
-    path.write_text(path.read_text().rstrip("\n"))
-    load_dataset("mrclam_6", folder)
-
-
 def test_empty_files(folder):
     (folder / "Robot1_Measurement.dat").write_text("# nothing seen\n")
     with pytest.warns(DataWarning, match="no detections of robot 1"):
         assert len(load_dataset("mrclam_6", folder).robots[0].detections) == 0
     (folder / "Robot1_Odometry.dat").write_text("# nothing\n")
     assert "Robot1_Odometry.dat:1: 0 rows" in message(folder)
-
-
-def test_binary_file(folder):
-    (folder / "Robot1_Odometry.dat").write_bytes(bytes(range(256)))
-    assert "Robot1_Odometry.dat:" in message(folder)
 
 
 @pytest.mark.parametrize("file", ["Robot2_Odometry.dat", "Robot3_Groundtruth.dat"])

@@ -7,7 +7,6 @@ import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.observers.registry import find, find_embedded, named, portable
 from coopenv.scenario.schema import neighbour_sets
 from coopenv.sources.worlds import Replay
-from coopenv.world import warp_internals
 from coopenv.world.embedded import Embedded, send_nothing, start_nothing
 from coopenv.world.state import array
 from tests.helpers.commands import refused
@@ -401,25 +399,3 @@ def test_warp_starts_without_its_banner_before_an_observer_on_the_host(monkeypat
     monkeypatch.setattr(kernel_observer, "model_of", lambda *given: (called.append("model"), model(*given))[1])
     find("riccati")(simulated().setups[0])
     assert called[:2] == ["start", "model"]
-
-
-GENERATED = (
-    "void f(Record var_model)\n{\n    Record var_model = _wp_args->model;\n    wp::address(x, i); wp::index(x, i);\n}"
-)
-
-
-@pytest.mark.parametrize("module", ["users_own", "coopenv.of_the_test"])
-def test_kernels_and_functions_of_other_modules_have_the_source_that_warp_gives_them(
-    monkeypatch: pytest.MonkeyPatch, module: str
-) -> None:
-    function = SimpleNamespace(__module__=module)
-    kernel = SimpleNamespace(
-        func=function, module=SimpleNamespace(name=module), options={}, adj=SimpleNamespace(args=[])
-    )
-    monkeypatch.setattr(warp_internals, "_generate", lambda *_: GENERATED)
-    monkeypatch.setattr(warp_internals, "_generate_function", lambda *_, **given: GENERATED)
-    options = {"enable_backward": False}
-    made = warp_internals._kernel_source(kernel, "cpu", options)
-    called = warp_internals._function_source(SimpleNamespace(func=function), device="cpu", options=options)
-    assert made == called and (made == GENERATED) == (module == "users_own")
-    assert ("coopenv::element" in made) == (module != "users_own")

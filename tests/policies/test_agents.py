@@ -132,19 +132,6 @@ def test_agents_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert find_agent(folder.rename(tmp_path / "le\x1b[2Jfty")).name == r"le\x1b[2Jfty"  # no terminal obeys it
 
 
-def test_whatever_is_an_agent_drives_a_run() -> None:
-    class Model:
-        """As Stable-Baselines3's."""
-
-        def predict(self, rows: np.ndarray, deterministic: bool) -> tuple[np.ndarray, None]:
-            return Peek(coopenv.load_scenario("facade"))(rows), None
-
-    names: list[Any] = ["peek", Peek, Model(), load_agent("peek", "facade")]
-    ways = [coopenv.run("facade", policy=policy, steps=5).trajectory.position for policy in names]
-    for way in ways[1:]:
-        np.testing.assert_array_equal(way, ways[0])
-
-
 def test_models_keep_their_memory_by_episode_and_their_normalisation() -> None:
     class Counts:
         """As a recurrent model of Stable-Baselines3: the first entry of an action counts the decisions of a row."""

@@ -17,7 +17,6 @@ import pytest
 from pettingzoo.test import parallel_api_test
 
 import coopenv
-from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.backend import open_svea
 from coopenv.cars.codec import decode
 from coopenv.cars.profile import SVEA, Role
@@ -226,12 +225,3 @@ def test_actions_mean_the_same_speeds_and_angles(folder: Path, processes: Path) 
     check(open_zenoh("client", endpoints), over_zenoh(processes))
     with fakes(path := write_fleet(folder)) as (hub, _):
         check(hub.connect(), in_process(path, hub))
-
-
-def test_unknown_options_are_refused(make: Make) -> None:
-    env = make()
-    try:
-        with pytest.raises(CoopenvError, match="nonsense"):
-            env.reset(seed=0, options={"nonsense": 1})
-    finally:
-        env.close()

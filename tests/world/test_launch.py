@@ -21,7 +21,6 @@ from coopenv.sources.worlds import Simulated
 from coopenv.world import launch, state
 from coopenv.world import world as batches
 from coopenv.world.launch import start_warp
-from coopenv.world.warp_internals import device_function
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.processes import COOPENV, ROOT, small_disk
 
@@ -110,88 +109,6 @@ def test_tensors_share_memory_and_agree_with_numpy(device: str, autoreset: str) 
         assert given[3].cpu().numpy().tolist() == expected[3].tolist()
         np.testing.assert_allclose(given[0].cpu().numpy(), expected[0], atol=2e-3)
         np.testing.assert_allclose(given[1].cpu().numpy(), expected[1], atol=2e-3)
-
-
-@wp.struct
-class Single:
-    values: wp.array(dtype=wp.float32)
-    step: wp.float32
-
-
-@wp.struct
-class Double:
-    values: wp.array(dtype=wp.float64)
-    step: wp.float64
-
-
-@device_function
-def stepped(state: Any, i: int, times: int):
-    return state.values[i] + state.step * type(state.step)(times)
-
-
-@device_function
-def advance(state: Any, i: int, times: int):
-    state.values[i] = stepped(state, i, times)
-
-
-def make_twice(function: Any) -> Any:
-    """Return a function that closes over another one, as an observer's do."""
-
-    @device_function
-    def twice(state: Any, i: int, times: int):
-        function(state, i, times)
-        function(state, i, times)
-
-    return twice
-
-
-advance_twice = make_twice(advance)
-
-
-def move(state: Any, times: int):
-    advance_twice(state, wp.tid(), times)
-
-
-def start_of(record: Any, dtype: Any) -> Any:
-    state = record()
-    state.values = wp.array([1.0, 2.0, 3.0], dtype=dtype, device="cpu")
-    state.step = 0.5
-    return state
-
-
-@pytest.mark.parametrize(("record", "dtype"), [(Single, wp.float32), (Double, wp.float64)])
-def test_functions_write_into_the_arrays_of_records(record: Any, dtype: Any) -> None:
-    state = start_of(record, dtype)
-    wp.launch(launch.kernel(move, dtype.__name__), dim=3, inputs=[state, 3], device="cpu")
-    np.testing.assert_allclose(state.values.numpy(), [4.0, 5.0, 6.0])
-
-
-def test_records_are_handed_over_by_reference_and_numbers_are_not() -> None:
-    for function in (advance, advance_twice, stepped):
-        overload = function.get_overload([Single, wp.int32, wp.int32], {})
-        assert overload.input_types == {"state": wp.ref[Single], "i": wp.int32, "times": wp.int32}
-
-
-def test_what_is_no_record_stays_a_value() -> None:
-    @device_function
-    def increased(state: Any):
-        return state + type(state)(1.0)
-
-    assert increased.get_overload([wp.float32], {}).input_types == {"state": wp.float32}
-
-
-@pytest.mark.parametrize(
-    ("features", "target"),
-    [(launch.X86_64_V3 | {"avx512f"}, "-O1 -target-cpu x86-64-v3"), ({"avx2"}, "-march=native -O1")],
-)
-def test_kernels_have_one_threshold_of_inlining_and_are_shared_by_processors_of_a_level(
-    monkeypatch: pytest.MonkeyPatch, features: set[str], target: str
-) -> None:
-    flags = "-march=native -mllvm=-inline-threshold=9000 -O1 -mllvm=-slp-recursion-max-depth=4"
-    monkeypatch.setattr(wp.config, "cpu_compiler_flags", flags)
-    monkeypatch.setattr(launch, "INLINE_THRESHOLD", 7)
-    monkeypatch.setattr(launch, "cpu_features", lambda: frozenset(features))
-    assert launch.compiler_options()["cpu_compiler_flags"] == f"{target} -mllvm=-inline-threshold=7"
 
 
 @pytest.mark.parametrize("flags", [None, "", "-march=native -O0"])

@@ -230,22 +230,6 @@ def test_terms_in_a_file_beside_the_scenario(tmp_path: Path) -> None:
         assert first[1] == pytest.approx(-gain * first[4]["position_error"], rel=1e-5)
 
 
-def test_a_program_needs_one_file_for_a_reward_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    program = tmp_path / "program.py"
-    program.write_text(
-        "import json, numpy as np, coopenv\n"
-        "def slow(ego):\n"
-        "    return -ego.time\n"
-        "coopenv.register_reward('slow', slow)\n"
-        "env = coopenv.make_vec('crossing_path', num_worlds=1, overrides={'reward.weights.slow': 1.0})\n"
-        "env.reset(seed=0)\n"
-        "print(json.dumps(env.step(np.zeros((1, 2)))[1].tolist()))\n",
-        encoding="utf-8",
-    )
-    runpy.run_path(str(program), run_name="__main__")
-    assert json.loads(capsys.readouterr().out) == [pytest.approx(-0.1)]
-
-
 @pytest.mark.parametrize(
     ("terms", "message"),
     [
@@ -302,12 +286,6 @@ def test_errors_of_tables_are_one_line(tables: str, message: str, tmp_path: Path
     with pytest.raises(ScenarioError, match=message) as caught:
         coopenv.load_scenario(scenario_file(tmp_path, tables))
     assert str(caught.value).isprintable() and "mine.toml" in str(caught.value)
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    path = scenario_file(tmp_path, '[reward.custom]\nmine = "missing.py:mine"\n')
-    with pytest.raises(CoopenvError, match=f"reward term 'mine': .*no such file: {tmp_path}/missing.py"):
-        coopenv.parallel_env(path)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from tensordict.nn.distributions import NormalParamExtractor
-from torchrl.envs import EnvBase, GymEnv, PettingZooWrapper, SerialEnv
+from torchrl.envs import EnvBase, GymEnv, PettingZooWrapper
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 from torchrl.objectives import ClipPPOLoss
@@ -25,7 +25,6 @@ from torchrl_env import batched_env
 
 import coopenv
 from coopenv.api.parallel_env import PlainInfos
-from coopenv.api.vector_env import TrueEnds
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.torchrl
@@ -49,13 +48,6 @@ def test_its_environment_of_gymnasium(options: dict[str, Any]) -> None:
     env = GymEnv("coopenv/OpenSquare-v0", **options)
     check_env_specs(env)
     assert env.rollout(3).batch_size == torch.Size([3])
-
-
-def test_its_environment_of_gymnasium_in_series_and_with_pictures() -> None:
-    env = SerialEnv(2, lambda: GymEnv("coopenv/OpenSquare-v0"))
-    assert env.rollout(3).batch_size == torch.Size([2, 3])
-    pictured = GymEnv("coopenv/OpenSquare-v0", from_pixels=True, pixels_only=False)
-    assert pictured.rollout(1)["pixels"].shape[-1] == 3
 
 
 @pytest.mark.parametrize("options", [{}, {"use_mask": True, "done_on_any": False, "return_state": True}], ids=str)
@@ -123,25 +115,6 @@ def test_each_world_is_a_parallel_env(name: str, overrides: dict[str, Any]) -> N
     assert rollout["next", "done"].sum(dim=1).min() >= 2  # so partial resets have happened
 
 
-def test_rows_are_those_of_the_batch() -> None:
-    actions = turning(3, 4)
-    rollout = rolled_out(batched_env(FOUR_WAY, num_worlds=3, seed=0, overrides={"horizon": 6.0}), actions)
-    batch = TrueEnds(coopenv.make_vec(FOUR_WAY, num_worlds=3, overrides={"horizon": 6.0}, autoreset="disabled"))
-    batch.reset(seed=0)
-    for t in range(STEPS):
-        _, rewards, terminated, truncated, infos = batch.step(actions.reshape(12, 2))
-        then = rollout[:, t]["next"]
-        assert np.array_equal(then["vehicle", "reward"].flatten(), rewards)
-        assert np.array_equal(then["vehicle", "truncated"].flatten(), truncated)
-        for event, code in (("arrived", 1), ("collided", 2)):
-            happened = terminated & (infos["ended"] == code)
-            assert np.array_equal(then["vehicle", "info", event].flatten().bool(), happened)
-        over = batch.unwrapped.engine.view("over") != 0
-        assert np.array_equal(then["done"].flatten(), over)
-        if over.any():
-            batch.reset(options={"reset_mask": over})
-
-
 def test_one_world_is_reset_and_no_other() -> None:
     env = batched_env(FOUR_WAY, num_worlds=3, seed=0)
     data = env.rollout(12)[:, -1]["next"].exclude("reward")
@@ -156,16 +129,6 @@ def test_one_world_is_reset_and_no_other() -> None:
     step = env.rand_step(after)
     shares = step["next", "state"][:, -1]
     assert shares[0] == shares[2] > 12 * shares[1] > 0.0
-
-
-def test_absent_vehicles_never_act() -> None:
-    env = batched_env("urban_crossing", num_worlds=16, seed=3)
-    mask = env.reset()["vehicle", "mask"]
-    assert 0 < (~mask).sum() < 32 and mask.any(dim=1).all()
-    rollout = env.rollout(5)
-    absent = ~rollout["vehicle", "mask"][:, 0]
-    assert rollout["next", "vehicle", "terminated"].squeeze(-1).transpose(1, 2)[absent].all()
-    assert not rollout["vehicle", "observation"].transpose(1, 2)[absent].any()
 
 
 def test_vehicles_of_prescribed_motion_are_no_agents() -> None:
