@@ -100,17 +100,6 @@ def listen(made: Recording, tamper: Any = None) -> Any:
     return run(Listens, made, tamper)
 
 
-def test_a_lie_states_a_pose_and_a_covariance() -> None:
-    listen(replace(recorded("jump"), interference=None))
-    honest = Listens.heard
-    listen(recorded("jump"))
-    vector = recorded("jump").interference.shift[-1, 1]
-    assert np.linalg.norm(vector) == pytest.approx(5.0)
-    for (time, before, _), (_, after, _) in zip(honest, Listens.heard, strict=True):
-        assert_allclose(after.position - before.position, vector if time >= 0.3 - 1e-9 else 0.0, atol=1e-12)
-        assert_allclose(after.covariance, 0.01 * np.eye(3) if time >= 0.3 - 1e-9 else before.covariance)
-
-
 def test_a_restart_begins_anew_and_nobody_else_does() -> None:
     listen(recorded("restart"))
     assert [vehicle for vehicle, _ in Listens.started] == [0, 1, 2, 3, 4, 1]
@@ -135,15 +124,6 @@ def test_a_joint_observer_has_every_vehicle_s_own_map() -> None:
     expected = np.zeros_like(wrong)
     expected[17:, 1, 1] = 2.0  # from tick 18 on, the second landmark of the second vehicle
     assert_allclose(wrong, expected, atol=1e-12)
-
-
-def test_clocks_shift_ages() -> None:
-    made = replace(recorded("clock"), staleness=np.inf)
-    listen(made)
-    clock = made.interference.clock
-    ahead = clock[1] - clock[2]
-    for time, _, age in Listens.heard[30:]:
-        assert age == pytest.approx(max(0.0, -ahead / 60), abs=1e-9) and time > 0.4
 
 
 def with_(**fields: Any) -> Any:

@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
-from coopenv.observers import Estimate, Message, Received, Recording, Tick, kernel_observer, register, registry
+from coopenv.observers import Estimate, Message, Received, Recording, Tick, register, registry
 from coopenv.observers.kernel_observer import MOST_UNITS, UNITS_PER_TICK
 from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.observers.registry import find, find_embedded, named, portable
@@ -390,12 +390,3 @@ def test_in_an_environment(observer: str | type) -> None:
 def test_a_scenario_cannot_name_code() -> None:
     with pytest.raises(CoopenvError, match=r"observer\.name"):
         coopenv.load_scenario("overtaking", {"observer.name": "mine.py:Mine"})
-
-
-def test_warp_starts_without_its_banner_before_an_observer_on_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
-    called: list[str] = []
-    start, model = kernel_observer.start_warp, kernel_observer.model_of
-    monkeypatch.setattr(kernel_observer, "start_warp", lambda: (called.append("start"), start()))
-    monkeypatch.setattr(kernel_observer, "model_of", lambda *given: (called.append("model"), model(*given))[1])
-    find("riccati")(simulated().setups[0])
-    assert called[:2] == ["start", "model"]

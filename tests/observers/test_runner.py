@@ -33,7 +33,6 @@ from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.helpers.recordings import completed
 from tests.helpers.recordings import simulated as recording
-from tests.helpers.sessions import ROOT, blocks
 from tests.oracles.batch import small_errors
 
 NAMES = sorted({*registry.zoo()} & {*registry.available_names(planar=False)})
@@ -374,23 +373,6 @@ def test_observers_of_installed_packages(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "broken" in list_observers() and "broken" not in registry.available_names()
     assert "theirs" in registry.available_names() and not registry.obstacle("theirs")
     assert "no_such_module" in registry.obstacle("broken") and "\n" not in registry.obstacle("broken")
-
-
-def filters_of_the_documents() -> dict[str, Any]:
-    """Return the filters that readers copy, by the name of their source."""
-    page = next(block for block in blocks(ROOT / "docs" / "tutorials" / "own_observer.md") if block.file)
-    tutorial: dict[str, Any] = {}
-    exec(compile(page.code, "own_observer.md", "exec"), tutorial)
-    return {"tutorial": tutorial["Mine"], "example": runpy.run_path(str(ROOT / "examples" / "own_observer.py"))["Ekf"]}
-
-
-@pytest.mark.parametrize("seed", [0, 5])
-def test_filters_of_the_documents_have_no_excursion_at_the_start(seed: int) -> None:
-    made = record(load_scenario("busy_intersection_tracking", {"horizon": 0.5}), seed)
-    for name, factory in filters_of_the_documents().items():
-        result = run(factory, made)
-        assert not result.failure and result.position_error.max() < 3.0, name
-        assert result.coordinates is Coordinates.LEFT and 0.2 < np.median(result.nees[1:]) / 6.0 < 5.0, name
 
 
 @pytest.mark.slow

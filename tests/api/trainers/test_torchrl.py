@@ -76,7 +76,13 @@ def rolled_out(env: EnvBase, actions: np.ndarray) -> TensorDict:
 
 @pytest.mark.parametrize(
     ("name", "overrides"),
-    [(FOUR_WAY, {"horizon": 6.0}), ("urban_crossing", {"horizon": 7.0}), (FOUR_WAY, TEAM), (FOUR_WAY, DRIVEN)],
+    [
+        (FOUR_WAY, {"horizon": 6.0}),
+        ("urban_crossing", {"horizon": 7.0}),
+        (FOUR_WAY, TEAM),
+        (FOUR_WAY, DRIVEN),
+        ("behind_truck", {"horizon": 6.0}),
+    ],
 )
 def test_each_world_is_a_parallel_env(name: str, overrides: dict[str, Any]) -> None:
     """Observations, rewards, ends, masks, states and infos of all episodes, the later ones included."""
@@ -101,7 +107,7 @@ def test_each_world_is_a_parallel_env(name: str, overrides: dict[str, Any]) -> N
                     assert np.array_equal(row["observation"], observations[agent])
                     assert row["reward"].item() == rewards[agent]
                     assert flags == [terminated[agent], truncated[agent], agent not in world.agents]
-                    for number in ("position_error", "orientation_error", "nees"):
+                    for number in ("position_error", "orientation_error", "nees", "arrived", "collided"):
                         assert row["info", number].item() == pytest.approx(infos[agent][number], rel=1e-6)
                 else:
                     assert flags == [True, False, True]
@@ -129,13 +135,6 @@ def test_one_world_is_reset_and_no_other() -> None:
     step = env.rand_step(after)
     shares = step["next", "state"][:, -1]
     assert shares[0] == shares[2] > 12 * shares[1] > 0.0
-
-
-def test_vehicles_of_prescribed_motion_are_no_agents() -> None:
-    env = batched_env("behind_truck", num_worlds=2, seed=3)
-    assert env.group_map == {"vehicle": ["vehicle_2"]}
-    rollout = env.rollout(5)
-    assert rollout["vehicle", "mask"].all() and rollout["next", "vehicle", "mask"].all()
 
 
 def test_seeds() -> None:
