@@ -1,4 +1,8 @@
-"""CPU time of tests by wing, which is the top folder of `tests`: printed after each run, and limited in a whole run."""
+"""CPU time of tests by wing, which is the top folder of `tests`: printed after each run, and limited in a whole run.
+
+CPU time of a test is that of its process and of the processes that it has started and waited for. It hardly depends on
+other work of the machine. Compilation of kernels and functions is a row of its own, as a warm cache has none.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +14,14 @@ from typing import Any
 
 import pytest
 
+from coopenv.estimation import compiled
 from coopenv.world import launch
 
 SHOWN = 40
 """Slowest tests that are listed."""
 LIMITS = {"api": 0.1}
-"""Largest share of each wing in the CPU time of a whole run without compilation, about 1.5 times its present share."""
+"""Largest share of a wing in the CPU time of a whole run without slow tests, about 1.5 times its present share."""
 COMPILATION = "compilation"
-"""Row of the time in which kernels are compiled or loaded: with an empty cache a quarter of the whole."""
 OTHER = "."
 """Wing of the files that stand in no folder of `tests`."""
 
@@ -39,12 +43,14 @@ class CpuTime:
     def __init__(self) -> None:
         self.by_test: dict[str, float] = defaultdict(float)
         self.compilation = 0.0
-        self._compiling, self._since = 0.0, used()
+        self._compiling = self._since = 0.0
 
     def measure_compilation(self) -> None:
-        """Measure from now on the time in which this process loads kernels."""
-        load = launch._launch
+        """Measure from now on the time in which this process compiles or loads kernels and functions."""
+        for module, name in ((launch, "_launch"), (compiled, "_made")):
+            setattr(module, name, self._measured(getattr(module, name)))
 
+    def _measured(self, load: Any) -> Any:
         @wraps(load)
         def measured(*given: Any) -> Any:
             before = used()
@@ -53,7 +59,7 @@ class CpuTime:
             finally:
                 self._compiling += used() - before
 
-        launch._launch = measured
+        return measured
 
     def pytest_runtest_logstart(self) -> None:
         self._since, self._compiling = used(), 0.0
@@ -61,14 +67,15 @@ class CpuTime:
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(self) -> Generator[None, pytest.TestReport, pytest.TestReport]:
         report = yield
-        report.user_properties += [("compilation", self._compiling), ("cpu", used() - self._since - self._compiling)]
-        self._since, self._compiling = used(), 0.0
+        now = used()
+        report.user_properties += [(COMPILATION, self._compiling), ("cpu", now - self._since - self._compiling)]
+        self._since, self._compiling = now, 0.0
         return report
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         of = dict(report.user_properties)
         self.by_test[report.nodeid] += of.get("cpu", 0.0)
-        self.compilation += of.get("compilation", 0.0)
+        self.compilation += of.get(COMPILATION, 0.0)
 
     def by_wing(self) -> dict[str, float]:
         """Return the CPU time (s) of each wing, the largest first."""
@@ -77,15 +84,26 @@ class CpuTime:
             sums[wing_of(test)] += seconds
         return dict(sorted(sums.items(), key=lambda pair: -pair[1]))
 
-    def excesses(self) -> list[str]:
-        """Return a line for each wing that takes more than its share."""
+    def excesses(self, markers: str) -> list[str]:
+        """Return a line for each wing that takes more than its share of a whole run; none of a part of the tests.
+
+        Args:
+            markers: expression by which tests are selected, pytest's option `-m`.
+        """
         wings = self.by_wing()
+        if "not slow" not in markers or LIMITS.keys() - wings.keys():
+            return []
         total = sum(wings.values())
         return [
-            f"tests/{wing}: {wings[wing] / total:.1%} of the CPU time, more than {limit:.1%}; mend its slowest tests"
-            for wing, limit in LIMITS.items()
-            if wings.get(wing, 0.0) > limit * total
+            f"{wing}: {seconds / total:.1%} of the CPU time of all tests, more than {LIMITS[wing]:.1%}; see its slowest"
+            for wing, seconds in wings.items()
+            if seconds > LIMITS.get(wing, 1.0) * total
         ]
+
+    def pytest_sessionfinish(self, session: pytest.Session, exitstatus: int) -> None:
+        controls = not hasattr(session.config, "workerinput")
+        if controls and exitstatus == pytest.ExitCode.OK and self.excesses(session.config.option.markexpr):
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         slowest = sorted(self.by_test.items(), key=lambda pair: -pair[1])[:SHOWN]
@@ -93,7 +111,9 @@ class CpuTime:
         for test, seconds in slowest:
             terminalreporter.write_line(f"{seconds:7.2f}  {test}")
         wings = self.by_wing()
-        total = sum(wings.values())
+        total = max(sum(wings.values()), 1e-9)
         for wing, seconds in wings.items():
-            terminalreporter.write_line(f"{seconds:7.1f}  {seconds / max(total, 1e-9):6.1%}  {wing}")
+            terminalreporter.write_line(f"{seconds:7.1f}  {seconds / total:6.1%}  {wing}")
         terminalreporter.write_line(f"{self.compilation:7.1f}          {COMPILATION}")
+        for line in self.excesses(terminalreporter.config.option.markexpr):
+            terminalreporter.write_line(line)

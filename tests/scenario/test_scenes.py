@@ -118,19 +118,13 @@ def test_a_ring_goes_round() -> None:
     ("name", "message"),
     [
         ("lane:1", "scene lane: vehicles = '1', allowed are whole numbers 2 to 4096"),
-        ("lane:many", "scene lane: vehicles = 'many', allowed are whole numbers 2 to 4096"),
         ("lane:8,seen=9", "scene lane: seen = '9', allowed are whole numbers 1 to 8"),
         ("roots:8,seed=1", "scene roots: unknown option 'seed'; allowed: vehicles (3..4096)"),
-        ("tree:8,9", "scene tree: unknown option '9'"),
         ("ring:8,seen=1,seen=2", "scene ring: seen is given twice"),
         ("lanes:8", "unknown environment 'lanes:8'"),
-        ("road:0", "scene road: vehicles = '0', allowed are whole numbers 2 to 64"),
         ("road:3,speed=-1", "scene road: speed = '-1', allowed are numbers 1 to 50"),
-        ("road:3,speed=nan", "scene road: speed = 'nan', allowed are numbers 1 to 50"),
         ("road:3,speed=1e1", "scene road: speed = '1e1', allowed are numbers 1 to 50"),
         ("road:3,foo=1", "unknown option 'foo'; allowed: vehicles (2..64), speed (1..50), lanes (1..2)"),
-        ("road:3,lanes=1.5", "scene road: lanes = '1.5', allowed are whole numbers 1 to 2"),
-        ("crossroad:9,lanes=1", "unknown option 'lanes'; allowed: vehicles (2..64), speed (1..50)"),
     ],
 )
 def test_a_wrong_name_is_one_error_line(name: str, message: str) -> None:

@@ -161,8 +161,6 @@ def test_a_jammer_blocks_the_receivers_in_its_range(dtype: str, delay: int) -> N
         ({"map_error": {"landmark": "L9"}}, r"faults.map_error.landmark: unknown landmark 'L9'; known: "),
         ({"map_error": {"chance": 1.5}}, "faults.map_error.chance"),
         ({"jammer": {"duty": 0.0}}, "faults.jammer.duty"),
-        ({"jammer": {"range": -1.0}}, "faults.jammer.range"),
-        ({"jammer": {"radius": 3.0}}, "faults.jammer.radius"),
     ],
 )
 def test_what_a_scenario_refuses(faults: dict[str, Any], message: str) -> None:

@@ -237,11 +237,10 @@ def test_of_many_processes_one_compiles(program: Path, tmp_path: Path) -> None:
     assert sorted("(compiled)" in line for line in loaded) == [False, True]
 
 
-@pytest.mark.parametrize(("variable", "place"), [("WARP_CACHE_PATH", "/dev/null"), ("HOME", "/proc/nowhere")])
-def test_a_place_that_cannot_be_is_one_line(variable: str, place: str, tmp_path: Path) -> None:
-    unset = [word for name in {"WARP_CACHE_PATH", "XDG_CACHE_HOME"} - {variable} for word in ("-u", name)]
+def test_a_place_that_cannot_be_is_one_line(tmp_path: Path) -> None:
+    place = "/proc/nowhere"
     command = (*COOPENV, "run", "overtaking", "--steps", "1", "--out", tmp_path / "result")
-    done = run("env", *unset, *command, **{variable: place})
+    done = run("env", "-u", "WARP_CACHE_PATH", "-u", "XDG_CACHE_HOME", *command, HOME=place)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert done.stderr.startswith(f"error: cannot keep compiled kernels in {place}/")
     assert "WARP_CACHE_PATH" in done.stderr

@@ -236,12 +236,10 @@ def test_terms_in_a_file_beside_the_scenario(tmp_path: Path) -> None:
         ("def error(ego:\n", "my_terms.py:error' cannot be loaded: SyntaxError"),
         ("def eror(ego):\n    return 1.0\n", "no 'error' in .*my_terms.py .did you mean 'eror'"),
         ("error = 3\n", "expected a function with a name .*, got 3"),
-        ("error = lambda ego: 1.0\n", "expected a function with a name"),
         ("def error(ego, truth, fleet, more):\n    return 1.0\n", "takes 4 records, expected 1 or 2 or 3"),
         ("def error(ego):\n    return ego.poistion\n", "cannot compile .* to return a number: .*poistion"),
         ("def error(ego):\n    return {1: ego.time}\n", "cannot compile .* to return a number: .*Dict"),
         ("def error(ego):\n    return ego.velocity\n", "cannot compile .* to return a number: .*vec3f"),
-        ("def error(ego):\n    later = ego.time\n", "cannot compile .* to return a number"),
         ("import numpy\ndef error(ego):\n    return numpy.median(ego.velocity)\n", "cannot compile .*numpy.median"),
         ("def error(ego, truth):\n    return truth.nees\n", "uses the truth: reward.privileged must be true"),
     ],
@@ -257,7 +255,6 @@ def test_errors_of_functions_are_one_line(terms: str, message: str, tmp_path: Pa
     ("size", "value", "message"),
     [
         ("2", "ego.velocity", "a vector of 2: .* length 3"),
-        ("3", "ego.velocity[0]", "a vector of 3"),
         ("1", "ego.velocity", "a number: .*vec3f"),
     ],
 )
@@ -293,14 +290,11 @@ def test_errors_of_tables_are_one_line(tables: str, message: str, tmp_path: Path
     [
         (lambda: coopenv.register_reward("progress", control_again), "reward term cannot be named 'progress'"),
         (lambda: coopenv.register_reward("error_again", control_again), "'error_again' is registered already"),
-        (lambda: coopenv.register_reward("my reward", control_again), "is an identifier, got 'my reward'"),
         (lambda: coopenv.register_reward("mine", 3), "reward term 'mine': expected a function with a name .*, got 3"),
-        (lambda: coopenv.register_reward("mine", lambda ego: 1.0), "expected a function with a name"),
         (lambda: coopenv.register_observation("goal", velocity_again), "cannot be named 'goal'"),
         (lambda: coopenv.register_observation("mine", velocity_again, per="target"), "takes 1 records, expected 2"),
         (lambda: coopenv.register_observation("mine", velocity_again, size=99), "'mine': size: .*got 99"),
         (lambda: coopenv.register_termination("collision", far_off), "cannot be named 'collision'"),
-        (lambda: coopenv.register_termination("privileged", far_off), "cannot be named 'privileged'"),
     ],
 )
 def test_errors_of_registration_are_one_line(register: Any, message: str) -> None:
