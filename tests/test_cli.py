@@ -93,7 +93,7 @@ def test_list_as_json(line: str, names: Callable[[], list[str]], capsys: pytest.
 
 
 @pytest.mark.parametrize("name", each_slow(coopenv.list_envs(), *ALIKE))
-def test_describe_says_what_matters_on_one_screen(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_description_fits_one_screen(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["describe", name]) == 0
     out = capsys.readouterr().out
     assert len(out.splitlines()) <= 24

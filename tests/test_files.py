@@ -170,7 +170,7 @@ def test_without_an_exchange_two_renames_do(place: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.usefixtures("without_exchange")
-def test_what_cannot_be_put_in_place_is_not_lost(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_result_that_cannot_be_put_in_place_is_not_lost(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rename = Path.rename
 
     def guarded(self: Path, target: Path) -> Path:
@@ -185,7 +185,7 @@ def test_what_cannot_be_put_in_place_is_not_lost(place: Path, monkeypatch: pytes
     assert generation_of(place / "result") == 0
 
 
-def test_what_the_user_has_is_kept_and_what_is_stale_goes(place: Path) -> None:
+def test_files_of_the_user_stay_and_stale_results_go(place: Path) -> None:
     (place / "result").chmod(0o750)
     (place / "result" / "link").symlink_to("nowhere")
     write("result", 1)
@@ -293,7 +293,7 @@ def test_impossible_files_are_refused_before_the_work(path: str, reason: str, pl
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_what_is_read_only_is_refused_before_the_work(place: Path) -> None:
+def test_read_only_targets_are_refused_before_the_work(place: Path) -> None:
     (place / "result" / "a.txt").chmod(0o444)
     with pytest.raises(OutputError, match="read-only"):
         check_file("result/a.txt")

@@ -124,7 +124,7 @@ def test_cores_are_counted_where_there_is_no_affinity(monkeypatch: pytest.Monkey
     assert available_cores() == 1
 
 
-def test_what_is_not_installed_has_no_version() -> None:
+def test_missing_distributions_have_no_version() -> None:
     assert set(versions("numpy", "no-such-distribution")) == {"python", "numpy"}
 
 

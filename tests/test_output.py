@@ -107,7 +107,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("record busy_intersection --out none/drive.mcap", "folder none does not exist"),
     ],
 )
-def test_one_line_and_nothing_is_left(
+def test_a_mistake_is_one_line_and_nothing_is_left(
     arguments: list[str] | str, words: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     there = sorted(folder.rglob("*"))

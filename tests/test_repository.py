@@ -59,7 +59,7 @@ def test_citation_and_changelog_are_of_this_version() -> None:
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
-def test_workflows_call_what_there_is(path: Path) -> None:
+def test_workflows_call_existing_targets(path: Path) -> None:
     targets = set(re.findall(r"^([\w./$()-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     targets = {target.replace("$(VENV)", ".venv") for target in targets}
     steps = [step for job in read(path)["jobs"].values() for step in job["steps"]]
@@ -101,7 +101,7 @@ def test_links_of_the_pages_at_the_top_lead_somewhere() -> None:
             assert (ROOT / target).exists(), f"{home}: {target}"
 
 
-def test_a_release_says_what_the_changelog_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_release_notes_are_those_of_the_changelog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(release_notes, "ROOT", tmp_path)
     (tmp_path / "pyproject.toml").write_text('[project]\nversion = "1.2.0"\n')
     (tmp_path / "CITATION.cff").write_text("version: 1.2.0\n")

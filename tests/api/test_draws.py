@@ -181,7 +181,7 @@ def test_drawn_landmarks_stand_in_the_truth_of_the_state() -> None:
     assert (np.abs(first[1:] - second[1:]).max(axis=1) > 1e-3).all()
 
 
-def test_a_run_says_who_was_absent() -> None:
+def test_a_run_names_absent_vehicles() -> None:
     run = Rollout(sometimes(), seed=1)
     assert len(list(run.play())) == 61
     words = [ending.outcome for ending in run.endings()]

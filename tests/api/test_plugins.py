@@ -219,7 +219,7 @@ def test_saved_states_go_on_as_if_nothing_had_happened(observer: str) -> None:
         assert np.array_equal(first[agent], again[agent]) and np.array_equal(first[agent], other[agent])
 
 
-def test_what_cannot_be_copied_is_reported() -> None:
+def test_a_state_that_cannot_be_copied_is_reported() -> None:
     locked = short("locked")
     locked.reset(seed=0)
     with pytest.raises(CoopenvError, match="observers' state cannot be copied: TypeError"):

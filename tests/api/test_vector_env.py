@@ -192,7 +192,7 @@ def test_wrong_actions(actions: np.ndarray, message: str) -> None:
         busy()[0].step(actions)
 
 
-def test_nan_on_the_device_harms_nobody_else() -> None:
+def test_nan_on_the_device_counts_as_zero_for_its_vehicle() -> None:
     """Where actions cannot be checked without waiting for the device, one that is not finite counts as zero."""
     env = coopenv.make_vec(FOUR_WAY, num_worlds=2, autoreset="disabled")
     twin = coopenv.make_vec(FOUR_WAY, num_worlds=2, autoreset="disabled")

@@ -58,7 +58,7 @@ def test_time_aware_observation_knows_the_horizon() -> None:
 
 
 @pytest.mark.parametrize("horizon", [1.05, 1.25])  # in the midst of a decision
-def test_the_spec_says_how_long_an_episode_is(horizon: float) -> None:
+def test_the_spec_has_the_length_of_an_episode(horizon: float) -> None:
     def never(observations: np.ndarray) -> np.ndarray:
         raise AssertionError("nobody else is here")
 

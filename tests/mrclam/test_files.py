@@ -143,7 +143,7 @@ def test_rows_a_little_late_are_put_in_order(folder):
     np.testing.assert_array_equal(after.odometry, before.odometry)
 
 
-def test_rows_whose_values_are_not_known_are_left_out(folder):
+def test_rows_with_unknown_values_are_left_out(folder):
     """The line that is named for another fault is still that of the file."""
     change(folder / "Robot3_Groundtruth.dat", 40, f"{ORIGIN + 0.70:.3f} NaN NaN NaN\n")
     with pytest.warns(DataWarning, match=r"rows with NaN left out: 1 of Robot3_Groundtruth.dat$"):
@@ -230,7 +230,7 @@ def test_a_command_is_not_held_for_ever(dataset):
     assert v.tolist() == [0.0, 0.2, 0.0, 0.1, 0.0]
 
 
-def test_what_is_of_no_use_is_told(tmp_path):
+def test_detections_without_use_are_reported(tmp_path):
     folder = write(tmp_path, seconds=40.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -260,7 +260,7 @@ def test_truth_in_degrees_or_mm_is_noticed(tmp_path):
             load_dataset("mrclam_6", folder)
 
 
-def test_detections_beyond_the_odometry_are_left_out_and_told(tmp_path):
+def test_detections_beyond_the_odometry_are_left_out_and_reported(tmp_path):
     folder = write(tmp_path, seconds=6.0)
     path = folder / "Robot2_Measurement.dat"
     table, others = np.loadtxt(path), [len(robot.detections) for robot in load_dataset("mrclam_6", folder).robots]

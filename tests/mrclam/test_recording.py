@@ -74,7 +74,7 @@ def test_bearings_are_turned_to_the_tick(recording):
     assert np.isnan(recording.bearings[~recording.visible]).all()
 
 
-def test_everybody_hears_everybody_a_tick_late(recording):
+def test_messages_arrive_one_tick_late(recording):
     inbox = recording.inbox_tick
     assert (inbox[0] == -1).all()
     for k in (1, 2, 3, 10):
@@ -105,7 +105,7 @@ def test_truth_has_gaps(dataset):
     assert heading_known[known & ((r.t < 7.9) | (r.t > 8.55))].all()
 
 
-def test_a_robot_seen_late_starts_where_dead_reckoning_says(dataset):
+def test_a_robot_seen_late_starts_at_its_dead_reckoning(dataset):
     r = recording_of(with_truth(dataset, 3, np.arange(6.0, 18.0, 0.02)), "landmarks")
     whole = recording_of(dataset, "landmarks")
     np.testing.assert_allclose(r.start_position, whole.start_position, atol=2e-3)

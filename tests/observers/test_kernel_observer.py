@@ -142,7 +142,7 @@ def test_malformed_messages_are_as_none_and_counted() -> None:
     assert follower.ignored_messages == len(bad)
 
 
-def test_a_message_from_before_the_start_is_not_heard() -> None:
+def test_a_message_from_before_the_start_is_not_received() -> None:
     follower, leader, recording = observer_and_leader()
     target = recording.setups[0].landmarks + 2
     follower.update(recording.tick(1, 3, {target: Received(leader.message(), 1.0)}))
@@ -196,7 +196,7 @@ COUNTER = Embedded("toy_counter", estimate, start, send_nothing, Counter)
 register(COUNTER.name, embedded=COUNTER)
 
 
-def test_what_is_no_function_of_kernels_is_one_line(tmp_path: Path) -> None:
+def test_functions_that_are_no_kernels_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(CoopenvError, match=r"observer 'plain': estimate: expected a Warp function \(@wp.func\) of 6"):
         Embedded("plain", lambda model, state, memory, world, vehicle, now: None, start, send_nothing)
     with pytest.raises(CoopenvError, match=r"observer 'few': send: expected a Warp function \(@wp.func\) of 6 arg"):
@@ -231,7 +231,7 @@ def test_an_estimate_that_is_no_number_ends_a_run() -> None:
 
 
 @pytest.mark.parametrize("observer", ["toy_counter", COUNTER])
-def test_it_runs_in_an_environment(observer: str | Embedded) -> None:
+def test_embedded_observers_run_in_an_environment(observer: str | Embedded) -> None:
     env = coopenv.parallel_env("busy_intersection", observer=observer, dtype="float64")
     env.reset(seed=0)
     env.step({agent: np.zeros(2) for agent in env.agents})
@@ -264,7 +264,7 @@ def test_batch_replay_and_saved_states_keep_its_memory() -> None:
     assert engine.world.memory.ticks.numpy().tolist() == [[7] * 5]
 
 
-def test_it_is_compared_with_others() -> None:
+def test_embedded_observers_are_compared_with_others() -> None:
     recording = simulated()
     for observer in ("toy_counter", COUNTER):
         result = completed(observer, recording)
@@ -369,13 +369,13 @@ def test_a_class_that_is_defined_once_more_takes_the_place_of_the_old_one() -> N
 
 
 @pytest.mark.parametrize("observer", ["mine.py:number", 3, lambda setup: None, object()])
-def test_what_is_no_observer(observer: object) -> None:
+def test_objects_that_are_no_observers_are_refused(observer: object) -> None:
     with pytest.raises(CoopenvError, match="expected a"):
         named(observer)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("observer", ["mine.py:Mine", Other])
-def test_in_an_environment(observer: str | type) -> None:
+def test_observers_in_files_estimate_in_an_environment(observer: str | type) -> None:
     """It estimates as the observer of the zoo that it is derived from."""
     options = {"dtype": "float64", "overrides": {"horizon": 0.5}}
     estimates = []

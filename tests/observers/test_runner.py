@@ -70,7 +70,7 @@ def probe(record_: Recording) -> list[tuple[str, Tick]]:
     return Mine.seen
 
 
-def test_without_delay_a_leader_is_heard_in_the_same_tick() -> None:
+def test_without_delay_a_leader_is_received_in_the_same_tick() -> None:
     seen = probe(recording())
     assert len(seen) == 60 * 5
     for _, tick in seen:
@@ -189,7 +189,7 @@ class UnspeakableError(Exception):
         (lambda e: replace(e, nis="small", nis_dof=2), "TypeError"),
     ],
 )
-def test_what_is_no_estimate_is_one_error_line(change: Any, said: str) -> None:
+def test_invalid_estimates_are_one_error_line(change: Any, said: str) -> None:
     class Odd(Probe):
         def update(self, tick: Tick) -> Estimate:
             return change(super().update(tick))
@@ -221,7 +221,7 @@ def test_a_sent_message_does_not_change_any_more() -> None:
         (Message(np.full(3, np.nan)), "message: position is not a finite array of shape (3,) with numbers up to 1e+09"),
     ],
 )
-def test_what_is_no_message_is_one_error_line(odd: Any, said: str) -> None:
+def test_invalid_messages_are_one_error_line(odd: Any, said: str) -> None:
     class Odd(Probe):
         def message(self) -> Any:
             return odd if self.index == 6 else super().message()
@@ -238,7 +238,7 @@ SENSED = ("rotation", "translation", "velocity", "angular_velocity", "targets", 
 
 
 @pytest.mark.parametrize("name", [*SENSED, "lever_arm"])
-def test_what_is_sensed_cannot_be_written_to(name: str) -> None:
+def test_sensed_values_are_read_only(name: str) -> None:
     class Vandal(Probe):
         def update(self, tick: Tick) -> Estimate:
             getattr(tick, name)[:] = 0
@@ -248,7 +248,7 @@ def test_what_is_sensed_cannot_be_written_to(name: str) -> None:
 
 
 @pytest.mark.parametrize("restored", [False, True])
-def test_what_all_receivers_hear_none_can_write_to(restored: bool) -> None:
+def test_messages_to_all_receivers_are_read_only(restored: bool) -> None:
     made = recording()
     group = ObserverGroup(Probe, made.observer_init)
     group.start(made.start_rotation, made.start_position)

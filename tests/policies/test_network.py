@@ -120,7 +120,7 @@ SLOW = {**WHOLE, "action.longitudinal": "acceleration"}
         (SLOW, {"dynamics.max_speed": 1.5}, r"another dynamics\.max_speed, 1\.0"),
     ],
 )
-def test_what_gives_entries_another_meaning_is_refused_with_both_values(
+def test_settings_that_change_the_meaning_of_entries_are_refused_with_both_values(
     common: dict[str, Any], overrides: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     """The size of the observation may be the same: without this an agent would drive by what it misreads."""

@@ -86,7 +86,7 @@ def test_sections_must_fit_one_another(
         fleet(*neighbours, **sections)
 
 
-def test_what_just_fits_is_taken() -> None:
+def test_values_at_their_limits_are_accepted() -> None:
     assert fleet(None, None, observer={"k": [1.0, 2.0]}).observer.k == (1.0, 2.0)
     fleet(None, dynamics={"latency": 0.1})
 
@@ -274,7 +274,7 @@ def test_routes_that_follow_one_another_have_a_limit(monkeypatch: pytest.MonkeyP
         parse_scenario(raw, "here")
 
 
-def test_what_a_file_stands_for_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_expanded_size_of_a_file_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files, "MOST_BYTES", 1000)
     many = {**builders.vehicle(), "neighbours": ["L1"] * 100}
     with pytest.raises(ScenarioError, match=r"scenario: vehicles.0.count: 9 times its length is 0 MiB, over 0 MiB"):

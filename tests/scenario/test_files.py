@@ -119,7 +119,7 @@ def circular() -> dict[str, Any]:
     ],
     ids=lambda value: ascii(value)[1:20] if isinstance(value, str) else "value",
 )
-def test_overrides_that_are_none(file: Path, key: str, value: Any, words: str) -> None:
+def test_invalid_overrides_are_refused(file: Path, key: str, value: Any, words: str) -> None:
     with pytest.raises(ScenarioError, match=words) as caught:
         load_scenario(file, {key: value})
     assert len(str(caught.value)) < 400 and str(caught.value).isprintable()
@@ -209,7 +209,7 @@ def test_a_dict_is_what_its_file_is(file: Path) -> None:
         (3, {}, "^environment: expected a name, a path, a dict of its keys or a Scenario, got int"),
     ],
 )
-def test_what_is_no_scenario(wrong: Any, changes: dict[str, Any], words: str) -> None:
+def test_objects_that_are_no_scenarios_are_refused(wrong: Any, changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ScenarioError, match=words):
         load_scenario(wrong, changes)
 

@@ -156,7 +156,7 @@ def sections(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
                 yield from sections(kind)
 
 
-def test_every_number_whose_meaning_names_a_unit_has_it() -> None:
+def test_every_number_with_a_unit_in_its_description_has_that_unit() -> None:
     unit = re.compile(r"(?:^|, )(m|s|rad|Hz|m/s|rad/s|pixels)(?=[.;,: (]|$)")
     without = {
         f"{model.__name__}.{name}"

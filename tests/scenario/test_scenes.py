@@ -71,7 +71,7 @@ def test_every_scene_is_a_world(name: str) -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(names([kind for kind in SCENES if kind not in ROADS]))
-def test_nobody_leaves_the_scene(name: str) -> None:
+def test_vehicles_stay_in_the_scene(name: str) -> None:
     """Ten minutes long nobody gets farther than 26 m, or the length of a lap, from the start."""
     scenario = made(name)
     for vehicle in scenario.vehicles:
@@ -137,7 +137,7 @@ def test_paths_are_no_scenes() -> None:
     assert is_scene("lane:8") and not is_scene("lane:8.toml") and not is_scene("lane:a/b") and not is_scene("lane")
 
 
-def test_what_is_known_without_the_simulation_is_all_there_is() -> None:
+def test_names_of_scenes_are_known_without_the_simulation() -> None:
     assert tuple(SCENES) == installation.SCENES and [row["name"] for row in scene_rows()] == [
         f"{kind}:N" for kind in SCENES
     ]
@@ -164,7 +164,7 @@ def test_as_many_vehicles_as_allowed_run() -> None:
 
 
 @pytest.mark.parametrize("name", ["lane:6", "roots:6", "tree:7", "random:6,seed=4", "ring:4", "road:5", "crossroad:5"])
-def test_everybody_can_be_found(name: str) -> None:
+def test_bearings_locate_every_vehicle(name: str) -> None:
     """The bound falls below a quarter of a metre within seconds: the bearings of every vehicle suffice."""
     bound = cramer_rao_ancestors(record(made(name, horizon=8.0, rates__camera=20.0, rates__odometry=20.0), 0))
     assert bound.position[0].min() > 0.7 and bound.position[-1].max() < 0.3

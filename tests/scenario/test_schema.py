@@ -127,7 +127,7 @@ def test_impossible_values_are_refused_at_their_field(path: str, value: Any) -> 
         ("vehicles.0.initial_estimate.orientation_offset_wxyz", [1, 0, 0, 1], "needs a unit quaternion"),
     ],
 )
-def test_the_line_says_what_is_wrong(path: str, value: Any, text: str) -> None:
+def test_the_line_names_the_mistake(path: str, value: Any, text: str) -> None:
     assert text in complaint(changed(path, value))
 
 

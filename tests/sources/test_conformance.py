@@ -89,7 +89,7 @@ def assert_spaces_of_the_simulator(env: Env, observation: Any) -> None:
     assert env.observation_layout == expected.observation_layout
 
 
-def test_it_passes_the_official_test(make: Make) -> None:
+def test_sources_pass_the_official_test(make: Make) -> None:
     env = make()
     assert_spaces_of_the_simulator(env, "flat")
     with warnings.catch_warnings():

@@ -221,7 +221,7 @@ def sumo_scenario(folder: Path, **changes: Any) -> dict[str, Any]:
     }
 
 
-def test_what_a_scenario_takes_from_files_of_sumo(tmp_path: Path) -> None:
+def test_a_scenario_takes_the_map_of_files_of_sumo(tmp_path: Path) -> None:
     found = coopenv.scenario.parse_scenario(sumo_scenario(tmp_path), "corner")
     assert found.map.origin == (50.0, 20.0, 0.0)
     marks = {mark.name: mark.position for mark in found.landmarks}

@@ -190,7 +190,7 @@ def test_to_touch_other_traffic_is_a_collision() -> None:
     assert engine.view("ended")[0, 3] == 2 and engine.view("tick")[0] < 20
 
 
-def test_who_leaves_the_road_has_arrived() -> None:
+def test_a_vehicle_that_leaves_the_road_has_arrived() -> None:
     vehicles = [{"motion": {"kind": "driven"}}] + [{"motion": {"kind": "traffic"}}] * 2
     engine = engine_of(CROSSING, horizon=40.0, vehicles=vehicles)
     engine.reset([3])
@@ -238,12 +238,12 @@ def test_a_plain_environment_in_the_same_program_changes_nothing(monkeypatch: py
         ({"vehicles": [{"motion": {"kind": "traffic"}}]}, "vehicles: highway-env needs at least one that is driven"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(overrides: dict[str, Any], why: str) -> None:
+def test_mistakes_are_one_line(overrides: dict[str, Any], why: str) -> None:
     with pytest.raises(CoopenvError, match=why):
         coopenv.parallel_env(CROSSING, overrides=overrides)
 
 
-def test_what_is_missing_shows_when_it_begins() -> None:
+def test_missing_vehicles_are_named_at_the_reset() -> None:
     two = [{"motion": {"kind": "driven"}}] * 2
     crowd = [{"motion": {"kind": "driven"}}] + [{"motion": {"kind": "traffic"}}] * 9
     for name, overrides, why in (
@@ -290,7 +290,7 @@ def test_states_of_others_are_refused() -> None:
     assert np.array_equal(env.engine.view("position"), other.engine.view("position"))
 
 
-def test_its_roads_are_drawn() -> None:
+def test_roads_are_drawn() -> None:
     env = coopenv.parallel_env(ROUNDABOUT, render_mode="rgb_array")
     roads = env.scenario.roads
     assert len(roads) > 50 and not any(road.marked for road in roads)
@@ -304,7 +304,7 @@ def test_its_roads_are_drawn() -> None:
 
 
 @pytest.mark.parametrize(("name", "speed", "seed"), [(CROSSING, 10.0, 4), (ROUNDABOUT, 6.0, 1)])
-def test_its_way_can_be_driven_by_what_is_observed(name: str, speed: float, seed: int) -> None:
+def test_the_route_can_be_driven_by_observations(name: str, speed: float, seed: int) -> None:
     env = coopenv.parallel_env(name, observation="dict", overrides={"horizon": 20.0, "termination.collision": False})
     ahead = 2.0 * env.scenario.observation.route_step
     top, widest = env.scenario.dynamics.max_speed, env.scenario.action.steering

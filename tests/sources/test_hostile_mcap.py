@@ -92,7 +92,7 @@ def test_headers(key: str, value: Any, why: str, written: Path, tmp_path: Path) 
 
 @pytest.mark.parametrize("number", ["NaN", "1e999"])
 @pytest.mark.parametrize("key", ["dt", "setups.0.gains.k", "start_position.0.0"])
-def test_numbers_that_are_none(number: str, key: str, written: Path, tmp_path: Path) -> None:
+def test_non_finite_numbers(number: str, key: str, written: Path, tmp_path: Path) -> None:
     import json
 
     def change(facts: dict[str, Any]) -> bytes:
@@ -130,7 +130,7 @@ def test_a_scenario_of_others(written: Path, tmp_path: Path) -> None:
         (b'{"ticks": 1' + b"0" * 6000 + b"}", "recording.json"),
     ],
 )
-def test_headers_that_are_none(text: bytes, why: str, written: Path, tmp_path: Path) -> None:
+def test_invalid_headers(text: bytes, why: str, written: Path, tmp_path: Path) -> None:
     edit(written, tmp_path / "hostile.mcap", header=lambda facts: text)
     refused(tmp_path / "hostile.mcap", why)
 
@@ -188,7 +188,7 @@ def test_messages(topic: str, change: Callable[[bytes], bytes], why: str, writte
     refused(tmp_path / "hostile.mcap", why)
 
 
-def test_rotations_that_are_none(written: Path, tmp_path: Path) -> None:
+def test_invalid_rotations(written: Path, tmp_path: Path) -> None:
     def scaled(m: Sent) -> Iterable[Sent]:
         if (m.topic, m.tick) != ("/vehicle_4/truth_exact", 3):
             return [m]
@@ -252,7 +252,7 @@ def test_many_chunks_that_unpack_to_much(written: Path, tmp_path: Path, monkeypa
     refused(more, r"would unpack to 9437184, more than [89]\d{6}\b")  # the limit is for both
 
 
-def test_a_chunk_that_is_not_what_it_says(written: Path, tmp_path: Path) -> None:
+def test_a_chunk_of_another_size_than_stated(written: Path, tmp_path: Path) -> None:
     path = tmp_path / "hostile.mcap"
     bomb(written, path, 2**20, claimed=2**20 + 1)
     refused(path, "a chunk unpacks to 1048576 bytes, not to the stated 1048577")
@@ -282,7 +282,7 @@ def test_replays_check_what_they_are_given(written: Path) -> None:
             Replay(replace(good, **change), "drive")
 
 
-def test_what_could_not_be_read_is_not_written(tmp_path: Path) -> None:
+def test_unreadable_recordings_are_not_written(tmp_path: Path) -> None:
     made = simulated("crossing_path", horizon=0.1)
     with pytest.raises(DataError, match=r"^recording: dt: nan is not in"):
         write_recording(replace(made, dt=float("nan")), tmp_path / "drive.mcap")

@@ -256,7 +256,7 @@ def test_the_end_of_sumo_is_one_line_and_the_next_reset_begins_anew() -> None:
         env.step({agent: np.zeros(2) for agent in env.agents})
 
 
-def test_its_process_ends_with_the_program_that_has_started_it() -> None:
+def test_sumo_ends_with_the_program_that_has_started_it() -> None:
     code = (
         "import coopenv, os; env = coopenv.parallel_env('sumo_crossing'); env.reset(seed=0);"
         "print(env.engine.world.programs[0]._process.pid, flush=True); os._exit(0)"
@@ -288,13 +288,13 @@ def test_its_process_ends_with_the_program_that_has_started_it() -> None:
         ({"sumo.most_vehicles": 0}, r"sumo\.most_vehicles: 0 are too few, there are 2 on the road"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(overrides: dict[str, Any], why: str) -> None:
+def test_mistakes_are_one_line(overrides: dict[str, Any], why: str) -> None:
     with pytest.raises(CoopenvError, match=why) as caught:
         coopenv.parallel_env(CROSSING, overrides=overrides).reset(seed=0)
     assert "\n" not in str(caught.value)
 
 
-def test_without_sumo_one_line_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_sumo_one_line_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("coopenv.sumo.program.find_spec", lambda name: None)
     with pytest.raises(CoopenvError, match=r"^backend 'sumo' needs SUMO, which is not installed: pip install"):
         coopenv.parallel_env(CROSSING)

@@ -214,7 +214,7 @@ def run(*command: str | Path, **variables: str | Path) -> subprocess.CompletedPr
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
 
 
-def test_what_is_damaged_is_built_again(doubled: Callable[[Path], list[float]], tmp_path: Path) -> None:
+def test_damaged_modules_are_built_again(doubled: Callable[[Path], list[float]], tmp_path: Path) -> None:
     assert doubled(tmp_path) == [0.0, 2.0, 4.0]
     for suffix, left in ((".o", 0.5), (".o", 0.0), (".meta", 0.5)):
         (part,) = tmp_path.glob(f"wp_*double*/*{suffix}")
@@ -225,7 +225,7 @@ def test_what_is_damaged_is_built_again(doubled: Callable[[Path], list[float]], 
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks of files")
-def test_of_many_processes_one_compiles(program: Path, tmp_path: Path) -> None:
+def test_one_of_many_processes_compiles(program: Path, tmp_path: Path) -> None:
     loud = "    start_warp()\n    wp.config.log_level = wp.LOG_INFO\n"
     program.write_text(PROGRAM.replace("    start_warp()\n", loud))
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "WARP_CACHE_PATH": str(tmp_path / "cache")}

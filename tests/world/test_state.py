@@ -129,7 +129,7 @@ def test_orientation_offset_multiplies_the_truth_from_the_right() -> None:
         ({"quaternion_wxyz": [0, 1, 0, 0]}, Rotation.from_rotvec([np.pi, 0, 0])),
     ],
 )
-def test_absolute_belief_replaces_the_truth(absolute: dict[str, Any], base: Rotation) -> None:
+def test_an_absolute_estimate_replaces_the_truth(absolute: dict[str, Any], base: Rotation) -> None:
     state = drawn({**absolute, "orientation_offset_wxyz": TURN}, yaw_spread=0.5)
     expected = base * Rotation.from_quat(TURN, scalar_first=True)
     assert_allclose(state["estimate_rotation"][:, 0], np.tile(expected.as_matrix(), (WORLDS, 1, 1)), atol=1e-12)
@@ -143,7 +143,7 @@ def test_absolute_position_and_its_offset() -> None:
     assert_allclose(offset, np.tile([0.1, 0.2, 0.3], (WORLDS, 1)), atol=1e-12)
 
 
-def test_default_belief_is_the_truth() -> None:
+def test_the_default_estimate_is_the_truth() -> None:
     made = scenario(
         [
             {
@@ -216,7 +216,7 @@ def env() -> Any:
         ("over", (0,), 2),
     ],
 )
-def test_one_number_that_is_none(env: Any, name: str, index: tuple[int, ...], value: Any) -> None:
+def test_one_invalid_number_is_refused(env: Any, name: str, index: tuple[int, ...], value: Any) -> None:
     before = env.get_state()
     state = env.get_state()
     state[name][index] = value
@@ -240,7 +240,7 @@ def test_one_number_that_is_none(env: Any, name: str, index: tuple[int, ...], va
         (lambda s: s.update(scenario=None), "scenario"),
     ],
 )
-def test_what_is_no_state(env: Any, change: Any, field: str) -> None:
+def test_invalid_states_are_refused(env: Any, change: Any, field: str) -> None:
     before, state = env.get_state(), env.get_state()
     change(state)
     with pytest.raises(CoopenvError, match=field):

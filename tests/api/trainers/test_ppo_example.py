@@ -126,7 +126,7 @@ def test_parked_vehicles_are_left_out(ppo: ModuleType) -> None:
     assert buffer["terminated"].any() and not buffer["valid"].all()
 
 
-def test_advantages_against_a_sum_by_hand(ppo: ModuleType) -> None:
+def test_advantages_against_a_discounted_sum(ppo: ModuleType) -> None:
     """With lambda = 1 the return is the discounted sum, plus the value at the cut; three rows: cut, dead, going on."""
     args = ppo.Arguments(rollout=3, gamma=0.5, gae_lambda=1.0)
     off = torch.zeros(3, 3, dtype=torch.bool)

@@ -43,7 +43,7 @@ def test_specs(name: str) -> None:
 
 
 @pytest.mark.parametrize("options", [{}, {"frame_skip": 2}, {"observation": "dict"}], ids=str)
-def test_its_environment_of_gymnasium(options: dict[str, Any]) -> None:
+def test_gymnasium_environments_fit(options: dict[str, Any]) -> None:
     """It tries `frameskip` first, and looks for Python's words in the refusal."""
     env = GymEnv("coopenv/OpenSquare-v0", **options)
     check_env_specs(env)
@@ -52,7 +52,7 @@ def test_its_environment_of_gymnasium(options: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("options", [{}, {"use_mask": True, "done_on_any": False, "return_state": True}], ids=str)
 @pytest.mark.parametrize("name", ["open_square", FOUR_WAY])
-def test_its_wrapper_of_pettingzoo(name: str, options: dict[str, Any]) -> None:
+def test_the_wrapper_of_pettingzoo_fits(name: str, options: dict[str, Any]) -> None:
     world = coopenv.parallel_env(name, overrides={"horizon": 1.0})
     env = PettingZooWrapper(world, **options)
     check_env_specs(env)
@@ -121,7 +121,7 @@ def test_each_world_is_a_parallel_env(name: str, overrides: dict[str, Any]) -> N
     assert rollout["next", "done"].sum(dim=1).min() >= 2  # so partial resets have happened
 
 
-def test_one_world_is_reset_and_no_other() -> None:
+def test_a_single_world_is_reset() -> None:
     env = batched_env(FOUR_WAY, num_worlds=3, seed=0)
     data = env.rollout(12)[:, -1]["next"].exclude("reward")
     before = data.clone()

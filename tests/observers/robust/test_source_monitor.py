@@ -239,7 +239,7 @@ def test_a_landmark_s_fault_is_estimated(landmark: int, size: float) -> None:
     ("make", "of", "most"),
     rest_slow([(busy, (24.0, 0), 3.0), (busy, (24.0, 1), 3.0), (fast, (16.0, 0), 3.0), (lane, (), 4.0)], 0, 2, 3),
 )
-def test_who_is_honest_is_believed(make: Callable[..., Recording], of: tuple[float, ...], most: float) -> None:
+def test_honest_sources_stay_below_the_gate(make: Callable[..., Recording], of: tuple[float, ...], most: float) -> None:
     """Ratios are of a size of a chi-square, or below: nobody comes near the gate.
 
     Its median is 2.4 for 3 unknowns, and 0.45 for that of the velocity's fault, which is along it.

@@ -132,7 +132,7 @@ def test_driven_cars_know_their_errors() -> None:
 TURNED = {"camera.extrinsics_error": 0.01745}  # rad per axis: 1 deg
 
 
-def test_it_is_as_sure_as_it_may_be_and_finds_out_how_the_camera_is_turned() -> None:
+def test_a_declared_turn_of_the_camera_is_estimated_consistently() -> None:
     """A car that goes straight on tells its heading from the camera's by where its odometry leads."""
     nees, _, world = judged("busy_intersection_tracking", range(16), 10, 40, **TURNED)
     assert (nees.mean(axis=0) < 2.5).all()

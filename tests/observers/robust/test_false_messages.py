@@ -47,7 +47,7 @@ def from_odometry_to_map(pose: np.ndarray, odometry: np.ndarray) -> np.ndarray:
     ],
     ids=str,
 )
-def test_the_odometry_of_a_consistent_liar_leads_where_its_poses_do(
+def test_the_odometry_of_a_consistent_lie_agrees_with_its_poses(
     faults: dict[str, Any], low: float, high: float
 ) -> None:
     """The dead reckoning of an honest sender, and of messages altered on the way, does not."""
@@ -79,7 +79,7 @@ def verdicts(made: Scenario, seed: int, seconds: int) -> tuple[np.ndarray, np.nd
     ],
     ids=str,
 )
-def test_who_sees_a_liar_excludes_it_and_nobody_else(lie: dict[str, Any], by: list[int]) -> None:
+def test_receivers_exclude_a_lying_sender_in_view_alone(lie: dict[str, Any], by: list[int]) -> None:
     """But for a sender that the liar has misled, once in a world."""
     excluded = sum(verdicts(with_liars((1,), 12.0, **lie), seed, 10)[0] for seed in (400, 401))
     assert (excluded[by, 1] >= 1).all(), excluded
@@ -140,7 +140,7 @@ def errors_beside(sender: int, start: float, seed: int, horizon: float, altered:
 
 
 @pytest.mark.parametrize("sender", rest_slow([1, 3], 0))
-def test_altered_messages_of_one_sender_lead_nobody_astray(sender: int) -> None:
+def test_altered_messages_of_one_sender_cost_little(sender: int) -> None:
     """The messages may count or not; the other vehicles see two honest targets besides."""
     assert errors_beside(sender, 6.0, 2, 14.0, True).max() < 0.8
 
@@ -164,7 +164,7 @@ class OneAltered:
 
 
 @pytest.mark.parametrize("what", ["covariance", "odometry"])
-def test_a_single_absurd_message_makes_nobody_uncertain(what: str) -> None:
+def test_a_single_absurd_message_inflates_no_covariance(what: str) -> None:
     recording = honest_recording(9.0, 907)
     found = run("robust", recording, OneAltered(what))
     others = found.covariance[recording.t > 4.0][:, [0, 1, 3, 4]]

@@ -115,7 +115,7 @@ def test_the_right_of_way_is_that_of_the_order_where_all_receive_each_other() ->
 
 
 @pytest.mark.parametrize(("x", "speed"), [(0.9, 0.0), (2.5, 1.0)])
-def test_it_waits_for_what_blocks_its_way(x: float, speed: float) -> None:
+def test_a_follower_waits_for_vehicles_in_its_way(x: float, speed: float) -> None:
     assert RouteFollower(MUTUAL).speed(rows(0, **other(x, 0.0, np.pi / 2)))[0] == speed
 
 
@@ -169,7 +169,7 @@ def test_leaps_of_the_farthest_senders_are_seen_in_the_open_square() -> None:
 
 
 @pytest.mark.parametrize(("away", "speed"), [(2.0, 0.0), (4.8, 1.0)])
-def test_who_looks_around_gives_way_to_what_is_soon(away: float, speed: float) -> None:
+def test_planners_give_way_to_near_meetings_alone(away: float, speed: float) -> None:
     """Cars that turn to landmarks and back would otherwise wait for meetings that never come."""
     crossing = observation(**other(away, -away, np.pi / 2))  # would meet after so many seconds
     assert RouteFollower(SCENARIO).speed(crossing)[0] == 0.0
@@ -190,7 +190,7 @@ def test_plans_that_lead_towards_others_cost_more(side: float) -> None:
 
 
 @pytest.mark.parametrize(("std", "speed"), [(0.03, 1.0), (0.3, 0.0)])
-def test_who_is_sure_of_its_place_passes_closer(std: float, speed: float) -> None:
+def test_a_certain_vehicle_passes_closer(std: float, speed: float) -> None:
     crossing = other(3.0, -(3.0 - 0.83 * np.sqrt(2.0)), np.pi / 2)  # passes 0.83 m away
     assert RouteFollower(SCENARIO).speed(observation(position_std=np.log10(std), **crossing))[0] == speed
 
@@ -263,7 +263,7 @@ def test_the_center_of_a_body_counts() -> None:
         assert driver.clear(rows(0, **other(touching + more, 0.0, np.pi)), way)[0] == clear
 
 
-def test_it_measures_the_circle_that_a_car_drives_on() -> None:
+def test_the_circle_of_another_car_is_measured() -> None:
     """From two messages, in the frame of a car that itself moves and turns."""
     scenario = load_scenario("highway_roundabout")
     driver, own_speed, own_turn, radius = RouteFollower(scenario), 6.0, 0.3, 20.0
@@ -296,7 +296,7 @@ def test_the_intelligent_driver_keeps_its_distance() -> None:
     assert driver.drive(observation(velocity=[1.0, 0, 0]))[0][0] == pytest.approx(1.0)
 
 
-def test_beliefs_are_those_of_a_kalman_filter() -> None:
+def test_predicted_covariances_are_those_of_a_kalman_filter() -> None:
     rng = np.random.default_rng(0)
     root = rng.normal(size=(3, 3))
     P = root @ root.T
@@ -330,7 +330,7 @@ def test_a_bearing_that_may_be_missing_counts_by_its_odds() -> None:
     np.testing.assert_allclose(np.array(maybe), 0.7 * np.array(never) + 0.3 * np.array(surely), atol=1e-12)
 
 
-def test_what_is_in_view_is_less_certain_near_the_edges_and_far_away() -> None:
+def test_odds_of_a_view_fall_near_the_edges_and_far_away() -> None:
     view = FieldOfView(SCENARIO.camera)
     offset = np.array([[3.0, 0.0], [3.0, 1.5], [3.0, -1.5], [3.0, 8.0], [40.0, 0.0]])
     odds = view.odds(offset, np.zeros(5), np.full(5, 0.1), np.full(5, 0.2))
@@ -348,7 +348,7 @@ def test_a_field_of_view_is_that_of_the_camera() -> None:
     assert around.sees(offset, np.zeros(6)).all()
 
 
-def test_what_is_needed_is_named() -> None:
+def test_missing_observation_fields_are_named() -> None:
     few = square(**{"observation.include": [group for group in GROUPS if group != "map"]})
     with pytest.raises(ValueError, match=r"agent 'peek' cannot be built: the observation lacks map_position "):
         load_agent("peek", few)
@@ -369,7 +369,7 @@ def test_distances_fit_the_car() -> None:
     assert Peek(load_scenario("highway_intersection")).ahead == pytest.approx(0.4 * 5.0 / 0.586)
 
 
-def test_it_steers_cars_of_highway_env_on_the_circle_that_it_pursues() -> None:
+def test_cars_of_highway_env_are_steered_on_the_pursued_circle() -> None:
     """highway-env's kinematic bicycle, from the published equations, gets to the point that is pursued."""
     driver = RouteFollower(load_scenario("highway_intersection"))
     for direction in (-0.4, 0.1, 0.5):
@@ -380,7 +380,7 @@ def test_it_steers_cars_of_highway_env_on_the_circle_that_it_pursues() -> None:
 
 
 @pytest.mark.parametrize(("brakes", "speed"), [(5.0, -1.0), (20.0, 1.0)])
-def test_who_stops_slowly_stops_for_one_across_its_way_that_may_stand(brakes: float, speed: float) -> None:
+def test_slow_brakes_stop_for_a_vehicle_across_the_way(brakes: float, speed: float) -> None:
     """Driving at full speed the other would be gone in time."""
     scenario = load_scenario("highway_intersection", {"dynamics.max_acceleration": brakes, "v2x.links": "neighbours"})
     first = np.arange(len(scenario.vehicles) - 1) == 0
@@ -400,7 +400,7 @@ def fields(**given: Any) -> Any:
     return lambda name: np.asarray(given[name], dtype=float)
 
 
-def test_boxes_hide_what_the_oracle_says() -> None:
+def test_occlusion_by_boxes_is_the_oracle_s() -> None:
     rng = np.random.default_rng(1)
     rows, camera_height, height, top = 40, 0.2, 0.6, 0.5
     angle, center = rng.uniform(-np.pi, np.pi, rows), rng.uniform(-2.0, 2.0, (rows, 2))
@@ -441,7 +441,7 @@ def test_boxes_are_those_of_the_map_and_the_messages() -> None:
     assert len(few.boxes(read)) == 1  # who does not see where it is knows of no building
 
 
-def test_what_the_truck_hides_is_worth_nothing() -> None:
+def test_landmarks_behind_the_truck_are_worth_nothing() -> None:
     """A car is lost, with landmarks ahead and to the left; a truck ahead is heard in one of two observations."""
     scenario = load_scenario("behind_truck")
     fields: dict[str, Any] = {

@@ -42,7 +42,7 @@ EXPECTED = {"a turned camera": (0.7, 1.2)}
 
 
 @pytest.mark.parametrize("scene", rest_slow(SCENES, 0, 3, 5, 7, 10))
-def test_errors_are_as_large_as_their_covariances_say(scene: str) -> None:
+def test_errors_match_their_covariances(scene: str) -> None:
     name, overrides = SCENES[scene]
     made = load_scenario(name, {"observer.name": "robust", "horizon": 13.0, **overrides})
     nees = watched(made, SEEDS, 12, round(made.rates.camera), skipped=3, dtype="float32")[0]
@@ -85,7 +85,7 @@ def test_no_vehicle_knows_more_than_there_is(name: str) -> None:
     ),
     ids=str,
 )
-def test_everybody_is_as_sure_as_it_may_be(name: str, overrides: dict[str, float], most: float) -> None:
+def test_covariances_match_errors_in_deep_graphs(name: str, overrides: dict[str, float], most: float) -> None:
     """Starts of up to 10 degrees and 1 m; the mean over worlds of each vehicle.
 
     Also in circles, with wheels that are off by a tenth, with many to hear, and with late messages: up to 12 was seen
@@ -107,7 +107,7 @@ def lane(name: str, **overrides: float) -> World:
     return world
 
 
-def test_it_depends_on_those_that_it_has_heard() -> None:
+def test_a_vehicle_depends_on_received_senders() -> None:
     world = lane("lane:5,seen=2")
     memory: Any = world.memory
     world.advance(0)
@@ -116,7 +116,7 @@ def test_it_depends_on_those_that_it_has_heard() -> None:
     assert (memory.belief.numpy()["depends_on"] == [0, 0b1, 0b11, 0b111, 0b1111]).all()
 
 
-def test_nobody_depends_on_who_is_not_heard() -> None:
+def test_no_vehicle_depends_on_lost_messages() -> None:
     world = lane("lane:5,seen=2", **{"v2x.loss": 0.999999})
     world.advance(60)
     memory: Any = world.memory
@@ -124,7 +124,7 @@ def test_nobody_depends_on_who_is_not_heard() -> None:
     assert np.isfinite(world.view("estimate_position")).all() and np.isfinite(world.view("covariance")).all()
 
 
-def test_nobody_in_a_lane_is_met_again() -> None:
+def test_correlations_in_a_lane_stay_known() -> None:
     world = lane("lane:6,seen=3")
     memory: Any = world.memory
     for _ in range(20):

@@ -28,14 +28,14 @@ from tests.helpers.robust_ticks import (
 
 
 @pytest.mark.parametrize("name", ["lane:6", "random:9,seed=2"])
-def test_everybody_finds_its_place(name: str) -> None:
+def test_all_vehicles_find_their_places(name: str) -> None:
     found = search(all_lost(name, 24.0), range(8), 24.0)
     assert np.isfinite(found.settled).all()
     assert found.wrong.mean() < 0.005
     assert (found.nees.mean(axis=0) < 2.0).all()
 
 
-def test_who_hears_of_all_others_finds_its_place_in_the_paper_s_scene() -> None:
+def test_all_vehicles_find_their_places_in_the_paper_s_scene() -> None:
     """The fifth vehicle's solutions nearly meet until 17 s: it follows them, and is near long before they part."""
     found = search(load_scenario("busy_intersection", {"observer.name": "robust", "horizon": 25.0}), range(16), 24.0)
     assert np.isfinite(found.settled).all() and not found.wrong.any()
@@ -111,7 +111,7 @@ def found_after(truth: Pose, observer: OpenRobust, rng: np.random.Generator, see
     return truth, 600
 
 
-def test_the_pose_that_is_found_is_off_by_what_its_covariance_says() -> None:
+def test_errors_of_the_pose_that_is_found_match_its_covariance() -> None:
     """Over 60 vehicles that see four landmarks: NEES is of six numbers."""
     nees = []
     for seed in range(60):

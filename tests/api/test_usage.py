@@ -364,7 +364,7 @@ def test_an_error_within_a_property_stays_its_own() -> None:
     assert not hasattr(Broken(), "_hidden") and copy.deepcopy(Broken()).other == 1
 
 
-def test_rendering_says_why_there_is_no_picture() -> None:
+def test_rendering_without_a_picture_names_the_cause() -> None:
     env = coopenv.parallel_env(ENV)
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="render_mode='rgb_array'"):

@@ -78,7 +78,7 @@ EMBEDDING = [name for name, scenario in SHIPPED.items() if scenario.observer.nam
 
 
 @pytest.mark.parametrize("name", largest_slow(EMBEDDING, "highway_intersection"))
-def test_the_first_seconds_are_off_by_what_their_covariances_say(name: str) -> None:
+def test_errors_of_the_first_seconds_match_their_covariances(name: str) -> None:
     """Of errors that are no Gaussian the mean NEES is exact at the start, too: 3 of a turn and 3 of a place.
 
     Of a place uniform in a ball of radius r with the variance r^2 / 5 per axis, NEES is 5 u^2 with u^3 uniform: its
@@ -113,7 +113,7 @@ def test_the_first_seconds_are_off_by_what_their_covariances_say(name: str) -> N
 VEHICLES = 12
 
 
-def test_those_in_view_are_met_when_others_are_gone():
+def test_vehicles_in_view_take_the_place_of_vehicles_out_of_view():
     leaders, gone = 6, 4
     record = crowd(6.0, leaders, gone)
     left = record.ticks // 3 * record.dt
@@ -161,7 +161,7 @@ frame = st.tuples(
 
 @settings(max_examples=60, deadline=None)
 @given(frames=st.lists(frame, min_size=1, max_size=12))
-def test_any_meetings_leave_a_belief_in_order(frames):
+def test_any_meetings_leave_a_valid_state(frames):
     """Frames of (time since the last one, who is in view, who is heard and tells of whom)."""
     first = small_errors(12.0).tick(1, 0, {})
     L = len(first.landmarks)
