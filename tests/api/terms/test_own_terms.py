@@ -389,21 +389,6 @@ def test_a_value_that_is_not_finite_is_an_error(face: str, replaced: str, messag
         env.step(dict(zip(env.agents, actions, strict=False)) if face == "parallel" else actions)
 
 
-@pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
-def test_infos_of_a_batch_hold_every_term(autoreset: str) -> None:
-    overrides = {**OWN, "horizon": 0.2}
-    envs = coopenv.make_vec(FOUR_WAY, num_worlds=2, overrides=overrides, autoreset=autoreset)
-    weights = envs.scenario.reward.by_name
-    envs.reset(seed=0)
-    for _ in range(2):
-        _, rewards, _, _, infos = envs.step(np.full(envs.action_space.shape, 0.5, np.float32))
-    if autoreset == "same_step":
-        assert np.abs(infos["reward_terms"]["control_again"]).max() < np.abs(rewards).max()
-        infos = infos["final_info"]
-    assert list(infos["reward_terms"]) == [*REWARD_TERMS.built_in, "error_again", "control_again"]
-    assert rewards == pytest.approx(sum(weights[n] * v for n, v in infos["reward_terms"].items()), rel=1e-5)
-
-
 EXAMPLES = Path(__file__).parents[3] / "examples"
 
 

@@ -13,14 +13,11 @@ import pytest
 pytest.importorskip("torchrl", reason="needs the extra 'torchrl'")
 
 import torch
+import torchrl_ppo
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from tensordict.nn.distributions import NormalParamExtractor
 from torchrl.envs import EnvBase, GymEnv, PettingZooWrapper
 from torchrl.envs.utils import check_env_specs
-from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
-from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value import GAE
 from torchrl_env import batched_env
 
 import coopenv
@@ -159,46 +156,7 @@ def test_pictures() -> None:
     env.close()
 
 
-def test_ppo_trains_on_living_rows() -> None:
-    torch.manual_seed(1)
-    env = batched_env(FOUR_WAY, num_worlds=4, seed=1, overrides={"horizon": 15.0})
-    size = env.observation_spec["vehicle", "observation"].shape[-1]
-    network = torch.nn.Sequential(MLP(size, 4, num_cells=[64, 64]), NormalParamExtractor())
-    rows = "vehicle"
-    policy = ProbabilisticActor(
-        TensorDictModule(network, [(rows, "observation")], [(rows, "loc"), (rows, "scale")]),
-        spec=env.full_action_spec,
-        in_keys=[(rows, "loc"), (rows, "scale")],
-        out_keys=[(rows, "action")],
-        distribution_class=TanhNormal,
-        distribution_kwargs={"low": -1.0, "high": 1.0},
-        return_log_prob=True,
-        log_prob_key=(rows, "sample_log_prob"),
-    )
-    critic = TensorDictModule(MLP(size, 1, num_cells=[64, 64]), [(rows, "observation")], [(rows, "state_value")])
-    advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
-    loss = ClipPPOLoss(policy, critic, normalize_advantage=True)
-    keys = {name: (rows, name) for name in ("advantage", "value_target", "reward", "done", "terminated")}
-    advantage.set_keys(value=(rows, "state_value"), **keys)
-    loss.set_keys(
-        value=(rows, "state_value"), action=(rows, "action"), sample_log_prob=(rows, "sample_log_prob"), **keys
-    )
-    optimiser = torch.optim.Adam(loss.parameters(), 1e-3)
-    before = [parameter.detach().clone() for parameter in policy.parameters()]
-    errors = []
-    for _ in range(3):
-        with torch.no_grad():
-            rollout = advantage(env.rollout(100, policy, break_when_any_done=False))
-        vehicles = rollout[rows].exclude("info")
-        living = TensorDict({rows: vehicles[vehicles["mask"]]}, batch_size=[int(vehicles["mask"].sum())])
-        assert len(living) < vehicles["mask"].numel()
-        for _ in range(8):
-            losses = loss(living)
-            total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
-            assert torch.isfinite(total)
-            optimiser.zero_grad()
-            total.backward()
-            optimiser.step()
-            errors.append(losses["loss_critic"].item())
-    assert errors[7] < errors[0]
-    assert any(not torch.equal(a, b) for a, b in zip(before, policy.parameters(), strict=True))
+def test_the_example_learns() -> None:
+    losses, before, after = torchrl_ppo.train(updates=3, steps=100)
+    assert losses[7] < losses[0]
+    assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
