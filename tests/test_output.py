@@ -150,19 +150,19 @@ def test_a_closed_pipe_is_quiet(tmp_path: Path) -> None:
     assert (errors, process.returncode) == ("", 141)
 
 
-def test_results_are_kept_when_the_table_cannot_be_printed(tmp_path: Path) -> None:
-    with Path("/dev/full").open("w") as full:
-        command = (*COOPENV, "run", "overtaking", "--steps", "1", "--no-figures", "--out", "x")
-        process = start(command, tmp_path, stdout=full)
-        process.communicate(timeout=DEADLOCK)
-    assert process.returncode == 2
-    assert (tmp_path / "x" / "metrics.json").is_file()
+def test_results_are_kept_when_the_table_cannot_be_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full(io.StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(sys, "stdout", Full())
+    assert main(["run", "overtaking", "--steps", "1", "--no-figures", "--out", "x"]) == 2
+    assert Path("x/metrics.json").is_file()
 
 
 def test_without_any_standard_stream(tmp_path: Path) -> None:
     closed = ("bash", "-c", 'exec "$@" <&- >&- 2>&-', "bash")
-    for arguments, status in ((["nothing"], 2), (["schema", "--out", "s.json"], 0)):
-        assert start((*closed, *COOPENV, *arguments), tmp_path).wait(DEADLOCK) == status
+    assert start((*closed, *COOPENV, "schema", "--out", "s.json"), tmp_path).wait(DEADLOCK) == 0
     assert (tmp_path / "s.json").read_text().startswith("{")
 
 
@@ -210,12 +210,7 @@ COMMANDS = {
     "view crossing_path": "view",
     "film crossing_path --out film.mp4": "video",
     "run recorded.mcap": "log",
-    "describe recorded.mcap": "log",
-    "film recorded.mcap --out film.gif": "log",
-    "run drive.bag --map topics.toml": "log",
     "import drive.bag": "log",
-    "record crossing_path --out new.mcap": "log",
-    "bench observers recorded.mcap": "log",
     "train facade --out agent": "train",
     "dataset facade": "minari",
     "describe highway_intersection": "highway",
@@ -223,11 +218,7 @@ COMMANDS = {
     "bench observers overtaking --observers factor_graph": "bench",
     "bench observers overtaking --engine ray": "ray",
     "svea demo": "svea",
-    "svea router": "svea",
-    f"svea fake {FLEET} --car svea7": "svea",
     f"svea run {FLEET}": "svea",
-    f"svea keys {FLEET} --out keys": "svea",
-    f"svea health {FLEET} --car svea7": "svea",
 }
 """Command to the extra that it needs."""
 
