@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 import random
-import resource
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -347,20 +345,6 @@ def test_a_read_only_disk_is_found_before_the_work(disk: Path) -> None:
     with pytest.raises(OutputError, match="ead-only"):
         check_file(disk / "single.txt")
     assert generation_of(disk / "result") == 0
-
-
-def test_a_limit_on_the_size_of_files_keeps_the_old_result(place: Path) -> None:
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    kept = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
-    try:
-        with pytest.raises(OutputError, match="File too large"):
-            write("result", 123456)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, kept)
-    assert generation_of(place / "result") == 0
-    assert hidden(place) == []
 
 
 def test_a_folder_that_is_held_is_waited_for_so_long(tmp_path: Path) -> None:

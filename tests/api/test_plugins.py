@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from pettingzoo.test import parallel_api_test
 
 import coopenv
 import coopenv.observers.registry as registry
@@ -172,11 +171,6 @@ def test_ticks_of_a_single_precision_world_are_exact_rotations_and_unit_vectors(
     env.reset(seed=0)
     while env.agents:
         env.step(still(env))
-
-
-def test_official_test_and_observations_of_plugins() -> None:
-    parallel_api_test(short("mekf"), num_cycles=40)
-    assert short("mekf").observation_space("vehicle_1") == short(None).observation_space("vehicle_1")
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 import shutil
-import warnings
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -13,9 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from pettingzoo.test import parallel_api_test
-from pettingzoo.test.state_test import state_test
-from pettingzoo.utils import parallel_to_aec
 
 import coopenv
 from coopenv import CoopenvError
@@ -127,15 +123,6 @@ def test_actions_and_seeds_change_nothing(data: Path) -> None:
     for first, second in zip(play(env, 1), play(env, 2), strict=True):
         assert same(first[0], second[0])
         assert same(*({a: {**info, "reward_terms": {}} for a, info in step[-1].items()} for step in (first, second)))
-
-
-def test_official_tests(data: Path) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        parallel_api_test(coopenv.parallel_env("mrclam_6", data=data), num_cycles=200)
-        parallel_api_test(replayed(simulated(FOUR_WAY), "mekf"), num_cycles=40)
-    env = coopenv.parallel_env("mrclam_6", data=data)
-    state_test(parallel_to_aec(env), env)
 
 
 def test_unknown_truth_stays_out_of_rewards_and_state(data: Path) -> None:
