@@ -41,7 +41,7 @@ EXPECTED = {"a turned camera": (0.7, 1.2)}
 """Least and most of ANEES where the errors that are estimated with the pose are not small."""
 
 
-@pytest.mark.parametrize("scene", rest_slow(SCENES, 0, 3, 5, 7, 10))
+@pytest.mark.parametrize("scene", rest_slow(SCENES, 0, 5, 10))
 def test_errors_match_their_covariances(scene: str) -> None:
     name, overrides = SCENES[scene]
     made = load_scenario(name, {"observer.name": "robust", "horizon": 13.0, **overrides})
@@ -53,7 +53,7 @@ def test_errors_match_their_covariances(scene: str) -> None:
     assert (mean + 3.0 * error > least).all(), (mean, error)
 
 
-@pytest.mark.parametrize("name", rest_slow(["busy_intersection_tracking", "lane:4", "random:6,seed=521"], 0, 2))
+@pytest.mark.parametrize("name", rest_slow(["busy_intersection_tracking", "lane:4", "random:6,seed=521"], 0))
 def test_no_vehicle_knows_more_than_there_is(name: str) -> None:
     """Its covariance is no smaller, in any direction, than the bound over it and all whose messages can reach it."""
     overrides = {"horizon": 8.0, "noise.bearing.model": "isotropic", **SMALL_ERRORS}
@@ -80,7 +80,6 @@ def test_no_vehicle_knows_more_than_there_is(name: str) -> None:
             ("lane:8", {"v2x.delay": 12, "noise.velocity": 0.15, "noise.bearing.scale": 0.0005}, 1.6),
         ],
         0,
-        2,
         3,
     ),
     ids=str,

@@ -27,7 +27,7 @@ MOST = {
 """Where the median over worlds is not below 3."""
 
 
-@pytest.mark.parametrize("name", rest_slow(LIES, 0, 2, 3, 4, 5, 6, 8, 9, 10))  # not two of one kind
+@pytest.mark.parametrize("name", rest_slow(LIES, 0, 3, 4, 6, 8, 9))  # one of each kind
 def test_a_lie_costs_little_in_most_worlds(name: str) -> None:
     _, means = costs(name, range(6), 25)
     assert np.median(means) < MOST.get(name, 3.0), means
