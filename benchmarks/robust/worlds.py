@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coopenv.api.engine import Engine
-from coopenv.base.errors import evaluation_seed
+from coopenv.base.seeds import evaluation_seed
 from coopenv.estimation.poses import Array
 from coopenv.policies import decide, find_agent, restart
 from coopenv.scenario import Scenario
