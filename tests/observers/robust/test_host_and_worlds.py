@@ -23,7 +23,7 @@ from coopenv.observers.robust.constants import MAX_MEMBERS, MEAN_TIME
 from coopenv.observers.runner import start_covariances
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
-from tests.helpers.env_suite import SHIPPED, largest_slow, rest_slow
+from tests.helpers.env_suite import ALIKE, SHIPPED, largest_slow, rest_slow
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import completed, replayed
 from tests.helpers.robust_ticks import OpenRobust
@@ -77,7 +77,7 @@ def test_a_search_ends_for_leaders_first() -> None:
 EMBEDDING = [name for name, scenario in SHIPPED.items() if scenario.observer.name == "robust"]
 
 
-@pytest.mark.parametrize("name", largest_slow(EMBEDDING, "highway_intersection"))
+@pytest.mark.parametrize("name", largest_slow(EMBEDDING, *ALIKE))
 def test_errors_of_the_first_seconds_match_their_covariances(name: str) -> None:
     """Of errors that are no Gaussian the mean NEES is exact at the start, too: 3 of a turn and 3 of a place.
 
