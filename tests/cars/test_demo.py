@@ -23,15 +23,15 @@ from typer.testing import CliRunner
 from coopenv.base.errors import CoopenvError, DataWarning
 from coopenv.cars.backend.backend import open_svea
 from coopenv.cars.backend.station import Gates, Pacer
-from coopenv.cars.codec import encode, header, make
 from coopenv.cars.commands.demo import FLEETS, Demo, links_line, links_report
 from coopenv.cars.commands.svea import STOPPED
 from coopenv.cars.fake.car import fault_topic
 from coopenv.cars.fake.fleet import fakes as fake_processes
 from coopenv.cars.fake.fleet import free_port
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.profile import SVEA, USUAL, Role
-from coopenv.cars.zenoh import open_zenoh
+from coopenv.cars.link.zenoh import open_zenoh
+from coopenv.cars.messages.codec import encode, header, make
+from coopenv.cars.settings.profile import SVEA, USUAL, Role
 from coopenv.cli.app import app
 from coopenv.estimation.observability import Trajectory
 from coopenv.runs.command import execute, report

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.cars.codec import decode, encode, header, make, stamp_of, warm_up
-from coopenv.cars.profile import Role, VisionSettings, load_profile
-from coopenv.cars.readings import calibration_of, read
-from coopenv.cars.vision import Calibration
+from coopenv.cars.messages.codec import decode, encode, header, make, stamp_of, warm_up
+from coopenv.cars.messages.readings import calibration_of, read
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.profile import Role, VisionSettings, load_profile
 
 CAMERA = Calibration((640, 480), (450.0, 455.0), (322.0, 236.0), (0.0,) * 5)
 PIXELS = {7: (100.0, 50.0), 3: (500.5, 400.0)}

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 import coopenv
 from coopenv import CoopenvError
-from coopenv.cars.frames import FrameRenderer, PlacedTag, facing
-from coopenv.cars.vision import Calibration, dictionary_of, opencv
+from coopenv.cars.fake.frames import FrameRenderer, PlacedTag, facing
+from coopenv.cars.messages.vision import Calibration, dictionary_of, opencv
 from coopenv.observers.recording import Sensed
 from coopenv.scenario import Scenario, parse_scenario
 from coopenv.sources.base import Command

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from coopenv.cars.backend.backend import Svea, open_svea
-from coopenv.cars.codec import encode, make
-from coopenv.cars.deployment import load_deployment
 from coopenv.cars.fake.car import Fake, fault_topic
 from coopenv.cars.fake.fleet import prepare_fake, run
 from coopenv.cars.fake.lockstep import Hub, LockstepFakes
-from coopenv.cars.transport import Transport
+from coopenv.cars.link.transport import Transport
+from coopenv.cars.messages.codec import encode, make
+from coopenv.cars.settings.deployment import load_deployment
 
 PATIENT = """
 [safety] # a machine that runs many tests at once is slow

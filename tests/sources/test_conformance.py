@@ -19,10 +19,10 @@ from pettingzoo.test import parallel_api_test
 import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.backend import open_svea
-from coopenv.cars.codec import decode
-from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.transport import Arrival
-from coopenv.cars.zenoh import open_zenoh
+from coopenv.cars.link.transport import Arrival
+from coopenv.cars.link.zenoh import open_zenoh
+from coopenv.cars.messages.codec import decode
+from coopenv.cars.settings.profile import SVEA, Role
 from tests.helpers.cars import LAB, LAB_CARS, OVERTAKING, PATIENT, cars, fakes, write_fleet
 from tests.helpers.processes import COOPENV, start
 from tests.helpers.wire import free_port

@@ -21,13 +21,13 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding, NeighbourInbox
 from coopenv.cars.backend.buffers import FrameQueue, Odometer, PoseTrack
 from coopenv.cars.bags.clocks import NEAR, OUTLYING, Delay, checked, jumps, outlying
-from coopenv.cars.codec import decode, stamp_of
-from coopenv.cars.deployment import Deployment
-from coopenv.cars.profile import Role
-from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, read
-from coopenv.cars.sensor_settings import Correction, Sensors
-from coopenv.cars.transport import Arrival, Transport
-from coopenv.cars.vision import Calibration
+from coopenv.cars.link.transport import Arrival, Transport
+from coopenv.cars.messages.codec import decode, stamp_of
+from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.deployment import Deployment
+from coopenv.cars.settings.profile import Role
+from coopenv.cars.settings.sensors import Correction, Sensors
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Message, sealed
 from coopenv.observers.recording import Sensed, Truth, is_due

@@ -9,10 +9,10 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
 from coopenv.cars.backend.buffers import PlaceTrack
-from coopenv.cars.codec import header, make, pose
-from coopenv.cars.deployment import Car
-from coopenv.cars.profile import SVEA, CarProfile, Role
-from coopenv.cars.readings import CarPose, check_types
+from coopenv.cars.messages.codec import header, make, pose
+from coopenv.cars.messages.readings import CarPose, check_types
+from coopenv.cars.settings.deployment import Car
+from coopenv.cars.settings.profile import SVEA, CarProfile, Role
 from coopenv.estimation.poses import Array, left_covariance, skew
 from coopenv.observers.contract import Message, Received
 from coopenv.observers.robust.messages import from_six

@@ -7,11 +7,11 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.clock import CLOCK, Clock
-from coopenv.cars.gate import ARM, BOOL, COMMAND, STATUS, GateMode, Malformed, Reason, read, write, write_drive
-from coopenv.cars.keys import Signer, Verifier
-from coopenv.cars.profile import NEUTRAL, SVEA, CarProfile, Limits, Role
-from coopenv.cars.transport import MOST_BYTES, Arrival, Transport
+from coopenv.cars.gate.gate import ARM, BOOL, COMMAND, STATUS, GateMode, Malformed, Reason, read, write, write_drive
+from coopenv.cars.link.clock import CLOCK, Clock
+from coopenv.cars.link.keys import Signer, Verifier
+from coopenv.cars.link.transport import MOST_BYTES, Arrival, Transport
+from coopenv.cars.settings.profile import NEUTRAL, SVEA, CarProfile, Limits, Role
 
 MOST_WAITING = 256
 """Messages of one topic that wait for the next tick; older ones are dropped, so that a flood fills nothing."""

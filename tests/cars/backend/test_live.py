@@ -18,13 +18,13 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend import assembler
 from coopenv.cars.backend.backend import Svea
-from coopenv.cars.backend.drive import Drive
-from coopenv.cars.codec import encode, header, make
+from coopenv.cars.backend.recorded_drive import Drive
 from coopenv.cars.fake.car import Fake
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.profile import RESET_TOPIC, SVEA, Role
-from coopenv.cars.readings import Twist
-from coopenv.cars.transport import Arrival
+from coopenv.cars.link.transport import Arrival
+from coopenv.cars.messages.codec import encode, header, make
+from coopenv.cars.messages.readings import Twist
+from coopenv.cars.settings.profile import RESET_TOPIC, SVEA, Role
 from tests.helpers.cars import OVERTAKING, PATIENT, SAFETY, cars, fakes, send_fault, threaded_fakes, write_fleet
 
 AHEAD = np.array([0.2, 0.0])  # 0.3 m/s of f1

@@ -14,16 +14,16 @@ from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.buffers import StatusBoard
 from coopenv.cars.backend.station import LATE, Gates, Station
 from coopenv.cars.backend.watchdog import BEARING_STD, LinkMonitor, Watchdog, bearing_nis
-from coopenv.cars.clock import CLOCK, Clock, SimulatedClock
-from coopenv.cars.codec import encode, header, make
-from coopenv.cars.deployment import Remote, Safety
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.gate import Gate
-from coopenv.cars.gate_process import GateConnection
-from coopenv.cars.profile import SVEA, USUAL, Role
-from coopenv.cars.readings import CarPose, Sample, Twist
-from coopenv.cars.transport import Arrival
-from coopenv.cars.vision import Calibration
+from coopenv.cars.gate.gate import Gate
+from coopenv.cars.gate.process import GateConnection
+from coopenv.cars.link.clock import CLOCK, Clock, SimulatedClock
+from coopenv.cars.link.transport import Arrival
+from coopenv.cars.messages.codec import encode, header, make
+from coopenv.cars.messages.readings import CarPose, Sample, Twist
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.deployment import Remote, Safety
+from coopenv.cars.settings.profile import SVEA, USUAL, Role
 from coopenv.estimation.poses import exp_so3
 from coopenv.sources.base import VehicleBroadcast
 from tests.cars.backend.test_assembler import binding
@@ -274,7 +274,7 @@ def test_a_gate_that_does_not_open_says_why(yard: Yard) -> None:
 
 
 def refuse(*_message: object) -> None:
-    from coopenv.cars.gate import Reason, Rejected
+    from coopenv.cars.gate.gate import Reason, Rejected
 
     raise Rejected(Reason.SIGNATURE)
 

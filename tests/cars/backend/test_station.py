@@ -18,14 +18,14 @@ from coopenv.cars.backend.assembler import Assembler, Intake
 from coopenv.cars.backend.binding import Binding, bind
 from coopenv.cars.backend.buffers import KEPT, MOST_SAMPLES, Odometer, PlaceTrack
 from coopenv.cars.backend.station import MOST_WAITING, Pacer, Station
-from coopenv.cars.clock import Clock
-from coopenv.cars.codec import MOST_BYTES, encode, header, make
-from coopenv.cars.deployment import Car, Sensors
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.keys import Signer, Verifier
-from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.readings import Twist
-from coopenv.cars.transport import Arrival
+from coopenv.cars.link.clock import Clock
+from coopenv.cars.link.keys import Signer, Verifier
+from coopenv.cars.link.transport import Arrival
+from coopenv.cars.messages.codec import MOST_BYTES, encode, header, make
+from coopenv.cars.messages.readings import Twist
+from coopenv.cars.settings.deployment import Car, Sensors
+from coopenv.cars.settings.profile import SVEA, Role
 from coopenv.scenario import load_scenario
 
 PERIOD, TICKS = 0.01, 3

@@ -24,12 +24,12 @@ from rosbags.highlevel import AnyReader
 
 import coopenv
 from coopenv.base.errors import DataError, DataWarning, OutputError
-from coopenv.cars.backend.drive import PRESENCE, Drive, DriveRecorder, RecordedTransport
-from coopenv.cars.codec import MOST_BYTES, TICK, encode, header, make
+from coopenv.cars.backend.recorded_drive import PRESENCE, Drive, DriveRecorder, RecordedTransport
+from coopenv.cars.backend.sources import DRIVE
 from coopenv.cars.commands.demo import links_report
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.profile import STOPPED_TOPIC, SVEA, TICK_TOPIC, Role, presence_of
-from coopenv.cars.source import DRIVE
+from coopenv.cars.messages.codec import MOST_BYTES, TICK, encode, header, make
+from coopenv.cars.settings.profile import STOPPED_TOPIC, SVEA, TICK_TOPIC, Role, presence_of
 from coopenv.runs.command import execute, report
 from coopenv.runs.rollouts import Rollout
 from coopenv.sources.base import Command
@@ -146,9 +146,9 @@ def test_threads_write_what_they_like_and_the_order_of_each_is_kept(tmp_path: Pa
 WRITER = f"""
 import os, resource, sys, time
 from pathlib import Path
-from coopenv.cars.backend.drive import FLUSH, DriveRecorder
-from coopenv.cars.codec import encode
-from coopenv.cars.codec import make
+from coopenv.cars.backend.recorded_drive import FLUSH, DriveRecorder
+from coopenv.cars.messages.codec import encode
+from coopenv.cars.messages.codec import make
 recorder = DriveRecorder(Path("drive.mcap"), b"{{}}", {{"frames": "{TYPES[FRAMES]}"}})
 recorder.tick(0, 1)
 frame = encode(make("{TYPES[FRAMES]}"))

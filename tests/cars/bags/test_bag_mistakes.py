@@ -19,14 +19,14 @@ from numpy.testing import assert_allclose
 
 from coopenv import CoopenvError, DataError
 from coopenv.base.errors import DataWarning
-from coopenv.cars import codec
+from coopenv.cars.backend.sources import BAG
 from coopenv.cars.bags import files, streams
 from coopenv.cars.bags.bag import Bag
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TopicMapError, load_map
-from coopenv.cars.profile import Role
-from coopenv.cars.readings import Detections, Twist
-from coopenv.cars.source import BAG
+from coopenv.cars.messages import codec
+from coopenv.cars.messages.readings import Detections, Twist
+from coopenv.cars.settings.profile import Role
 from coopenv.cli.app import main
 from coopenv.estimation.poses import exp_so3
 from coopenv.scenario import load_scenario

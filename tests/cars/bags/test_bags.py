@@ -17,12 +17,12 @@ import coopenv
 from coopenv import CoopenvError, DataError
 from coopenv.base.errors import DataWarning
 from coopenv.bench.observers import sources
-from coopenv.cars import codec
-from coopenv.cars.backend.drive import DriveRecorder
+from coopenv.cars.backend.recorded_drive import DriveRecorder
+from coopenv.cars.backend.sources import BAG, DRIVE
 from coopenv.cars.bags.bag import Bag
 from coopenv.cars.bags.log import Shift, reconcile, recorders
 from coopenv.cars.bags.topics import regularity
-from coopenv.cars.source import BAG, DRIVE
+from coopenv.cars.messages import codec
 from coopenv.cli.app import main
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Sensed

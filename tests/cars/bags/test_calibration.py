@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from coopenv.base.errors import DataError
-from coopenv.cars.calibration import Calibrated, calibrate, toml_text
-from coopenv.cars.calibration_drives import CalibrationDrive, CarDrive
-from coopenv.cars.sensor_settings import Correction
-from coopenv.cars.vision import Calibration, rays
+from coopenv.cars.calibration.calibrate import Calibrated, calibrate, toml_text
+from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive
+from coopenv.cars.messages.vision import Calibration, rays
+from coopenv.cars.settings.sensors import Correction
 from coopenv.cli.app import main
 from coopenv.scenario import load_scenario
 from tests.helpers.commands import refused

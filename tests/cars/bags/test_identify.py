@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.cars.deployment import load_deployment
+from coopenv.cars.calibration.response import KINDS, Response, constants_of
 from coopenv.cars.fake.settings import FakeSettings
-from coopenv.cars.profile import SVEA
-from coopenv.cars.response import KINDS, Response, constants_of
+from coopenv.cars.settings.deployment import load_deployment
+from coopenv.cars.settings.profile import SVEA
 from coopenv.cli.app import main
 from tests.helpers import bags
 from tests.helpers.commands import refused

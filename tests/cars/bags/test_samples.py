@@ -9,12 +9,12 @@ import pytest
 
 import coopenv
 from coopenv.base.errors import DataWarning
-from coopenv.cars import identify
 from coopenv.cars.bags.bag import Bag
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import load_map
 from coopenv.cars.bags.topics import TopicRow, cars_of, examined, proposed, role_of
-from coopenv.cars.profile import Role
+from coopenv.cars.calibration import identify
+from coopenv.cars.settings.profile import Role
 from coopenv.cli.app import main
 from tests.helpers.commands import refused
 

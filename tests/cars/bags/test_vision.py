@@ -10,15 +10,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coopenv import CoopenvError
-from coopenv.cars import vision
 from coopenv.cars.bags.bag import Bag
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topics import examined, proposed
-from coopenv.cars.codec import make
-from coopenv.cars.frames import FrameRenderer, PlacedTag
-from coopenv.cars.profile import Role, VisionSettings
-from coopenv.cars.readings import Detections, read
-from coopenv.cars.vision import Calibration, find_tags, frame_of
+from coopenv.cars.fake.frames import FrameRenderer, PlacedTag
+from coopenv.cars.messages import vision
+from coopenv.cars.messages.codec import make
+from coopenv.cars.messages.readings import Detections, read
+from coopenv.cars.messages.vision import Calibration, find_tags, frame_of
+from coopenv.cars.settings.profile import Role, VisionSettings
 from coopenv.estimation.lens import distort, undistort
 from coopenv.observers import run
 from coopenv.runs.recorder import record

@@ -9,9 +9,9 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.cars.codec import stamp_of
-from coopenv.cars.deployment import Sensors
-from coopenv.cars.profile import Role
+from coopenv.cars.messages.codec import stamp_of
+from coopenv.cars.settings.deployment import Sensors
+from coopenv.cars.settings.profile import Role
 from coopenv.scenario import load_scenario
 from coopenv.sources.base import Command
 from coopenv.sources.worlds import Simulated

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import coopenv
-from coopenv.cars.codec import decode
-from coopenv.cars.gate import read_drive
-from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.transport import Arrival
-from coopenv.cars.zenoh import open_zenoh
+from coopenv.cars.gate.gate import read_drive
+from coopenv.cars.link.transport import Arrival
+from coopenv.cars.link.zenoh import open_zenoh
+from coopenv.cars.messages.codec import decode
+from coopenv.cars.settings.profile import SVEA, Role
 from tests.helpers.cars import OVERTAKING
 from tests.helpers.processes import COOPENV, ROOT, started, wait_until
 from tests.helpers.wire import free_endpoint

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.base.fault_text import FaultError
-from coopenv.cars.codec import stamp_of
 from coopenv.cars.fake import car
 from coopenv.cars.fake.settings import FAKE_FAULTS, CarFaults, fake_fault, fault_topic
-from coopenv.cars.profile import SVEA, Role
+from coopenv.cars.messages.codec import stamp_of
+from coopenv.cars.settings.profile import SVEA, Role
 from tests.helpers.fakes import CROSSING, EXACT, OVERTAKING, Stage
 
 

@@ -18,17 +18,17 @@ import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.assembler import Intake
 from coopenv.cars.backend.binding import bind
-from coopenv.cars.codec import decode, encode, header, make, stamp_of
-from coopenv.cars.deployment import DeploymentError, Sensors, load_deployment
 from coopenv.cars.fake.fleet import fakes
 from coopenv.cars.fake.lockstep import LockstepFakes
 from coopenv.cars.fake.settings import FakeSettings
-from coopenv.cars.profile import SVEA, CarProfile, Role, load_profile
-from coopenv.cars.readings import read
-from coopenv.cars.see import FrameReader
-from coopenv.cars.transport import Arrival
-from coopenv.cars.vision import Calibration
-from coopenv.cars.zenoh import open_zenoh
+from coopenv.cars.link.transport import Arrival
+from coopenv.cars.link.zenoh import open_zenoh
+from coopenv.cars.messages.codec import decode, encode, header, make, stamp_of
+from coopenv.cars.messages.readings import read
+from coopenv.cars.messages.see import FrameReader
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.deployment import DeploymentError, Sensors, load_deployment
+from coopenv.cars.settings.profile import SVEA, CarProfile, Role, load_profile
 from tests.helpers.cars import PATIENT
 from tests.helpers.fakes import CAMERA, EXACT, MARKER, MARKERS, OVERTAKING, Stage
 from tests.helpers.frames import BEARINGS, FLEET, FRAMES, grey_frame, seeing

@@ -13,14 +13,14 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.assembler import Intake
 from coopenv.cars.backend.station import Gates
 from coopenv.cars.bags.topic_map import load_map, patterns_of
-from coopenv.cars.codec import decode
-from coopenv.cars.deployment import DeploymentError, Remote, load_deployment
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.gate import PERIOD, Gate, GateClock, read_drive, write_drive
-from coopenv.cars.gate_process import GateConnection
-from coopenv.cars.profile import FOLDER, SVEA, USUAL, CarProfile, MotionCommand, Role, load_profile
-from coopenv.cars.readings import check_types
-from coopenv.cars.transport import Arrival
+from coopenv.cars.gate.gate import PERIOD, Gate, GateClock, read_drive, write_drive
+from coopenv.cars.gate.process import GateConnection
+from coopenv.cars.link.transport import Arrival
+from coopenv.cars.messages.codec import decode
+from coopenv.cars.messages.readings import check_types
+from coopenv.cars.settings.deployment import DeploymentError, Remote, load_deployment
+from coopenv.cars.settings.profile import FOLDER, SVEA, USUAL, CarProfile, MotionCommand, Role, load_profile
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 
 GOOD = """

@@ -14,14 +14,14 @@ from typing import Any
 import pytest
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.attack import Intruder, attack
 from coopenv.cars.backend.station import OLD, Gates, neutral_command
-from coopenv.cars.deployment import parse_deployment
-from coopenv.cars.gate import write_drive
-from coopenv.cars.keys import load_signer, make_keys
-from coopenv.cars.profile import SVEA, USUAL, MotionCommand, Role
-from coopenv.cars.transport import Tls
-from coopenv.cars.zenoh import Zenoh, open_zenoh
+from coopenv.cars.gate.attack import Intruder, attack
+from coopenv.cars.gate.gate import write_drive
+from coopenv.cars.link.keys import load_signer, make_keys
+from coopenv.cars.link.transport import Tls
+from coopenv.cars.link.zenoh import Zenoh, open_zenoh
+from coopenv.cars.settings.deployment import parse_deployment
+from coopenv.cars.settings.profile import SVEA, USUAL, MotionCommand, Role
 from tests.cars.link.gate.bench import CAR
 from tests.cars.link.gate.station import Station, running_gate
 from tests.helpers.brokers import Authority
@@ -157,7 +157,7 @@ def test_an_open_router_is_noticed_and_no_gate_behind_it_is_armed(tmp_path: Path
 
 def test_an_attack_finds_what_is_open(doors: Doors, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few = ("the same under wildcards", "arming, commands without signature", "services: arming, mode")
-    monkeypatch.setattr("coopenv.cars.attack.SETTLE", 0.25)
+    monkeypatch.setattr("coopenv.cars.gate.attack.SETTLE", 0.25)
     every = Intruder.kinds
     monkeypatch.setattr(Intruder, "kinds", lambda x: {k: v for k, v in every(x).items() if k.startswith(few)})
     make_keys(tmp_path / "keys", [CAR, "station"])

@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars import zenoh
-from coopenv.cars.keys import (
+from coopenv.cars.link import zenoh
+from coopenv.cars.link.keys import (
     DOMAIN,
     PUBLIC,
     KeyFileError,

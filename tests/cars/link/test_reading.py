@@ -14,10 +14,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from coopenv import CoopenvError
-from coopenv.cars import codec
-from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.readings import READERS, CarPose, CarStatus, Detections, Twist, read
-from coopenv.cars.vision import Calibration, rays
+from coopenv.cars.messages import codec
+from coopenv.cars.messages.readings import READERS, CarPose, CarStatus, Detections, Twist, read
+from coopenv.cars.messages.vision import Calibration, rays
+from coopenv.cars.settings.profile import SVEA, Role
 from coopenv.estimation.lens import distort, largest_radius, undistort
 from coopenv.observers.contract import Message
 from coopenv.world.camera import undistort as simulated

@@ -9,10 +9,10 @@ from typing import Any
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from coopenv.cars.codec import decode, stamp_of
-from coopenv.cars.gate import PERIOD, Gate, GateClock, Reason, read_drive
-from coopenv.cars.keys import Signer, Verifier
-from coopenv.cars.profile import SVEA, Limits, MotionCommand, Role
+from coopenv.cars.gate.gate import PERIOD, Gate, GateClock, Reason, read_drive
+from coopenv.cars.link.keys import Signer, Verifier
+from coopenv.cars.messages.codec import decode, stamp_of
+from coopenv.cars.settings.profile import SVEA, Limits, MotionCommand, Role
 from tests.cars.link.gate import messages
 
 CAR = "svea7"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from coopenv.cars.codec import encode, header, make
-from coopenv.cars.profile import SVEA, Role
+from coopenv.cars.messages.codec import encode, header, make
+from coopenv.cars.settings.profile import SVEA, Role
 
 
 def command(stamp: int, session: str, sequence: int, steering: float = 0.1, speed: float = 0.2) -> bytes:

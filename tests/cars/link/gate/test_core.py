@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coopenv.cars.gate import MOST_AHEAD, TIMEOUT, GateMode, Reason
-from coopenv.cars.profile import NEUTRAL, SVEA, Limits, MotionCommand, Role
+from coopenv.cars.gate.gate import MOST_AHEAD, TIMEOUT, GateMode, Reason
+from coopenv.cars.settings.profile import NEUTRAL, SVEA, Limits, MotionCommand, Role
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import LIMITS, MS, OTHER, STATION, Bench
 

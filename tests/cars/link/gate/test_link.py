@@ -15,10 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.clock import CLOCK
-from coopenv.cars.codec import decode, encode, header, make
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.gate import (
+from coopenv.cars.gate.gate import (
     ARM,
     BOOL,
     COMMAND,
@@ -31,8 +29,10 @@ from coopenv.cars.gate import (
     write,
     write_drive,
 )
-from coopenv.cars.gate_process import GateConnection, run
-from coopenv.cars.profile import NEUTRAL, SVEA, MotionCommand, Role
+from coopenv.cars.gate.process import GateConnection, run
+from coopenv.cars.link.clock import CLOCK
+from coopenv.cars.messages.codec import decode, encode, header, make
+from coopenv.cars.settings.profile import NEUTRAL, SVEA, MotionCommand, Role
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR, LIMITS, OTHER, STATION, Bench, messages_of_strangers
 from tests.cars.link.gate.messages import arm, framed_command, stop

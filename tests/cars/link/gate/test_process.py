@@ -17,9 +17,9 @@ from random import Random
 
 import pytest
 
-from coopenv.cars.keys import load_signer, load_verifier, make_keys
-from coopenv.cars.profile import NEUTRAL, Role
-from coopenv.cars.zenoh import LEASE, open_zenoh
+from coopenv.cars.link.keys import load_signer, load_verifier, make_keys
+from coopenv.cars.link.zenoh import LEASE, open_zenoh
+from coopenv.cars.settings.profile import NEUTRAL, Role
 from coopenv.cli.app import main
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR, messages_of_strangers
@@ -261,8 +261,8 @@ def test_the_health_check_of_the_image_reads_alone(
 def test_it_loads_neither_the_simulation_nor_numpy() -> None:
     code = (
         "import sys; sys.argv[0] = 'coopenv'\n"  # the package does not register environments for its own command
-        "import coopenv.cars.gate, coopenv.cars.gate_process, coopenv.cars.keys\n"
-        "import coopenv.cars.deployment, coopenv.cars.zenoh\n"
+        "import coopenv.cars.gate.gate, coopenv.cars.gate.process, coopenv.cars.link.keys\n"
+        "import coopenv.cars.settings.deployment, coopenv.cars.link.zenoh\n"
         "print(*sys.modules)"
     )
     result = subprocess.run(

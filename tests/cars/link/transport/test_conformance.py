@@ -13,15 +13,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coopenv.cars.codec import decode, encode, header, make, ros1
-from coopenv.cars.deployment import Car, DeploymentError
 from coopenv.cars.fake.lockstep import Hub, HubTransport
-from coopenv.cars.nats import open_nats
-from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.readings import CarPose, read
-from coopenv.cars.ros1 import Authors, open_ros1, routes_of
-from coopenv.cars.transport import Arrival, Transport, matcher
-from coopenv.cars.zenoh import open_zenoh
+from coopenv.cars.link.nats import open_nats
+from coopenv.cars.link.ros1 import Authors, open_ros1, routes_of
+from coopenv.cars.link.transport import Arrival, Transport, matcher
+from coopenv.cars.link.zenoh import open_zenoh
+from coopenv.cars.messages.codec import decode, encode, header, make, ros1
+from coopenv.cars.messages.readings import CarPose, read
+from coopenv.cars.settings.deployment import Car, DeploymentError
+from coopenv.cars.settings.profile import SVEA, Role
 from tests.helpers.brokers import nats_server, ros_master
 from tests.helpers.processes import wait_until
 from tests.helpers.wire import free_endpoint, free_port, heard_by, seen_by

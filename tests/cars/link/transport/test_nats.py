@@ -15,13 +15,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coopenv.cars import transport
-from coopenv.cars.codec import encode, make
-from coopenv.cars.deployment import parse_deployment
-from coopenv.cars.nats import MOST_WAITING, Letter, Outbox, open_nats, subject_of, subjects_of
-from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.transport import LEASE, MOST_PRESENT, HeartbeatTransport, LinkError, matcher
-from coopenv.cars.zenoh import open_transport
+from coopenv.cars.link import transport
+from coopenv.cars.link.nats import MOST_WAITING, Letter, Outbox, open_nats, subject_of, subjects_of
+from coopenv.cars.link.transport import LEASE, MOST_PRESENT, HeartbeatTransport, LinkError, matcher
+from coopenv.cars.link.zenoh import open_transport
+from coopenv.cars.messages.codec import encode, make
+from coopenv.cars.settings.deployment import parse_deployment
+from coopenv.cars.settings.profile import SVEA, Role
 from tests.helpers.brokers import Authority, nats_server
 from tests.helpers.processes import wait_until
 from tests.helpers.wire import free_port, heard_by, listening, seen_by

@@ -17,14 +17,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars import ros1
-from coopenv.cars.codec import decode, encode, header, make
-from coopenv.cars.codec import ros1 as types_of_ros1
-from coopenv.cars.deployment import parse_deployment
-from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.ros1 import ENVELOPE, open_ros1, opened, sealed
-from coopenv.cars.transport import Address, LinkError
-from coopenv.cars.zenoh import open_transport
+from coopenv.cars.link import ros1
+from coopenv.cars.link.ros1 import ENVELOPE, open_ros1, opened, sealed
+from coopenv.cars.link.transport import Address, LinkError
+from coopenv.cars.link.zenoh import open_transport
+from coopenv.cars.messages.codec import decode, encode, header, make
+from coopenv.cars.messages.codec import ros1 as types_of_ros1
+from coopenv.cars.settings.deployment import parse_deployment
+from coopenv.cars.settings.profile import SVEA, Role
 from tests.helpers.brokers import ros_master
 from tests.helpers.processes import started, wait_until
 from tests.helpers.wire import free_port, heard_by, listening

@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.deployment import Deployment, DeploymentError, parse_deployment
-from coopenv.cars.transport import Address, Arrival, LinkError, address_of
-from coopenv.cars.zenoh import Zenoh, open_transport, open_zenoh
+from coopenv.cars.link.transport import Address, Arrival, LinkError, address_of
+from coopenv.cars.link.zenoh import Zenoh, open_transport, open_zenoh
+from coopenv.cars.settings.deployment import Deployment, DeploymentError, parse_deployment
 from tests.helpers.brokers import Authority
 from tests.helpers.processes import wait_until
 from tests.helpers.wire import ECHO, PING, PONG, free_endpoint, free_port, heard_by, listening, running, seen_by
@@ -50,7 +50,7 @@ def answered(client: Zenoh, heard: list[Arrival]) -> None:
 @pytest.mark.parametrize("listen", ["subscribe", "watch"])
 def test_a_process_that_raises_ends_though_its_session_is_open(endpoint: str, listen: str) -> None:
     script = f"""
-from coopenv.cars.zenoh import open_zenoh
+from coopenv.cars.link.zenoh import open_zenoh
 open_zenoh("router", listen=["{endpoint}"]).{listen}("any/**", print)
 raise SystemExit(3)
 """

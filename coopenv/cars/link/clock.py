@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from typing import ClassVar
 
-from coopenv.cars.gate import GateClock
+from coopenv.cars.gate.gate import GateClock
 
 POLL = 0.01  # s
 End = Callable[[], None]

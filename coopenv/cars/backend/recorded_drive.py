@@ -21,12 +21,12 @@ from coopenv.base.files import writing
 from coopenv.base.installation import install_command, version
 from coopenv.cars.backend.assembler import Assembler, Intake
 from coopenv.cars.backend.binding import OPTIONS, Binding, bind, reset_options
+from coopenv.cars.backend.sources import DRIVE_METADATA
 from coopenv.cars.backend.station import refusal
-from coopenv.cars.codec import STOPPED, TICK, decode, encode, header, make, stamp_of
-from coopenv.cars.deployment import Deployment, parse_deployment
-from coopenv.cars.profile import STOPPED_TOPIC, TICK_TOPIC, presence_of
-from coopenv.cars.source import DRIVE_METADATA
-from coopenv.cars.transport import Arrival, Transport
+from coopenv.cars.link.transport import Arrival, Transport
+from coopenv.cars.messages.codec import STOPPED, TICK, decode, encode, header, make, stamp_of
+from coopenv.cars.settings.deployment import Deployment, parse_deployment
+from coopenv.cars.settings.profile import STOPPED_TOPIC, TICK_TOPIC, presence_of
 from coopenv.scenario import parse_scenario
 from coopenv.scenario.files import override
 from coopenv.scenario.own_terms import without_own_terms

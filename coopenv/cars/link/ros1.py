@@ -24,11 +24,8 @@ from typing import Any
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import needing
-from coopenv.cars.codec import cdr_of, decode, encode, make, ros1, ros1_of
-from coopenv.cars.deployment import Car, DeploymentError
-from coopenv.cars.gate import read_drive
-from coopenv.cars.profile import AUTHORS, SVEA, CarProfile, CommandMessage, MotionCommand, Role
-from coopenv.cars.transport import (
+from coopenv.cars.gate.gate import read_drive
+from coopenv.cars.link.transport import (
     Address,
     Arrival,
     Callback,
@@ -39,6 +36,9 @@ from coopenv.cars.transport import (
     matcher,
     trouble_at,
 )
+from coopenv.cars.messages.codec import cdr_of, decode, encode, make, ros1, ros1_of
+from coopenv.cars.settings.deployment import Car, DeploymentError
+from coopenv.cars.settings.profile import AUTHORS, SVEA, CarProfile, CommandMessage, MotionCommand, Role
 
 PER_PERCENT = 1.27  # of the whole numbers of lli_ctrl
 DEAD_BAND = 15.0  # % of the speed controller's range about zero in which the wheels do not turn

@@ -8,11 +8,11 @@ from queue import Empty, Queue
 from typing import Any
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.codec import decode, encode, header, make, stamp_of
-from coopenv.cars.profile import CarProfile, Role
-from coopenv.cars.readings import Detections, read
-from coopenv.cars.transport import Arrival, Transport
-from coopenv.cars.vision import Calibration
+from coopenv.cars.link.transport import Arrival, Transport
+from coopenv.cars.messages.codec import decode, encode, header, make, stamp_of
+from coopenv.cars.messages.readings import Detections, read
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.profile import CarProfile, Role
 
 SILENT = 2.0  # s without a frame that are worth a line
 

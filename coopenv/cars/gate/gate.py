@@ -1,6 +1,6 @@
 """The gate on a car's own computer: the only process that commands the wheels.
 
-These are its decisions, without threads, clocks or a network of its own, and its few messages as CDR; gate_process.py
+These are its decisions, without threads, clocks or a network of its own, and its few messages as CDR; process.py
 connects it to the network. It starts quickly and needs neither NumPy nor the simulation.
 
 It starts disarmed. An arming by the station names a session and the nonce that the gate has shown last; the nonce is a
@@ -26,8 +26,8 @@ from enum import StrEnum
 from typing import Any
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.keys import Verifier, is_identity
-from coopenv.cars.profile import NEUTRAL, SVEA, CarProfile, CommandMessage, Limits, MotionCommand, Role
+from coopenv.cars.link.keys import Verifier, is_identity
+from coopenv.cars.settings.profile import NEUTRAL, SVEA, CarProfile, CommandMessage, Limits, MotionCommand, Role
 
 ENCAPSULATION = b"\0\1\0\0"
 LONGEST_PADDING = 3  # bytes after the last field, which some writers add

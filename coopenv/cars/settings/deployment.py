@@ -12,8 +12,9 @@ from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
 from coopenv.base.sections import Section, read_toml, validated, with_tables
 from coopenv.cars.fake.settings import USUAL as DEFAULT_FAKE
 from coopenv.cars.fake.settings import FakeSettings
-from coopenv.cars.gate import TIMEOUT
-from coopenv.cars.profile import (
+from coopenv.cars.gate.gate import TIMEOUT
+from coopenv.cars.link.transport import SECURE, UNIX, Tls, address_of
+from coopenv.cars.settings.profile import (
     MOST_CHANNELS,
     SVEA,
     USUAL,
@@ -27,8 +28,7 @@ from coopenv.cars.profile import (
     is_simple,
     load_profile,
 )
-from coopenv.cars.sensor_settings import Name, Sensors, read_calibration
-from coopenv.cars.transport import SECURE, UNIX, Tls, address_of
+from coopenv.cars.settings.sensors import Name, Sensors, read_calibration
 
 Endpoint = Annotated[str, AfterValidator(lambda text: address_of(text) and text)]  # such as tcp/127.0.0.1:7447
 

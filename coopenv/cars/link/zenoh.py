@@ -13,9 +13,8 @@ from weakref import WeakSet
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, needing
-from coopenv.cars.clock import CLOCK
-from coopenv.cars.deployment import Deployment, DeploymentError
-from coopenv.cars.transport import (
+from coopenv.cars.link.clock import CLOCK
+from coopenv.cars.link.transport import (
     SECURE,
     UNIX,
     Arrival,
@@ -26,6 +25,7 @@ from coopenv.cars.transport import (
     address_of,
     first_trouble,
 )
+from coopenv.cars.settings.deployment import Deployment, DeploymentError
 
 LEASE = 1000  # ms after which a process that has frozen no longer counts as present
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
@@ -190,14 +190,14 @@ def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:
     network, certificates = deployment.network, certificates_of(deployment)
     if network.kind == "zenoh":
         return open_zenoh("client", network.connect, tls=certificates, timeout=timeout)
-    from coopenv.cars.ros1 import Authors, routes_of
+    from coopenv.cars.link.ros1 import Authors, routes_of
 
     routes = [route for car in deployment.cars for route in routes_of(car, deployment.profile)]  # before any is opened
     if network.kind == "nats":
-        from coopenv.cars.nats import open_nats
+        from coopenv.cars.link.nats import open_nats
 
         return Authors(open_nats(network.connect, certificates, timeout), routes)
-    from coopenv.cars.ros1 import open_ros1
+    from coopenv.cars.link.ros1 import open_ros1
 
     types = {route.name: route.theirs for route in routes}
     return Authors(open_ros1(network.connect[0], types, timeout), routes)

@@ -11,10 +11,10 @@ from scipy.ndimage import uniform_filter1d
 
 from coopenv.base.errors import DataError
 from coopenv.cars.backend.binding import marker_places
-from coopenv.cars.profile import Role
-from coopenv.cars.readings import sightings_of, tracks_of, yaw_of
-from coopenv.cars.sensor_settings import Correction
-from coopenv.cars.vision import Calibration, rays
+from coopenv.cars.messages.readings import sightings_of, tracks_of, yaw_of
+from coopenv.cars.messages.vision import Calibration, rays
+from coopenv.cars.settings.profile import Role
+from coopenv.cars.settings.sensors import Correction
 from coopenv.estimation.poses import Array, log_so3
 from coopenv.scenario import Scenario
 

@@ -15,7 +15,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import least_squares
 
 from coopenv.base.errors import DataError
-from coopenv.cars.calibration_batch import LEAST_PLACE, LOSS, Kind, by_stretch, deviation, standard_errors
+from coopenv.cars.calibration.batch import LEAST_PLACE, LOSS, Kind, by_stretch, deviation, standard_errors
 from coopenv.estimation.poses import Array, Mask
 from coopenv.world.dynamics import follow_commands
 from coopenv.world.launch import kernel, launch, start_warp

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.vision import Calibration, dictionary_of, find_tags, opencv, rays
+from coopenv.cars.messages.vision import Calibration, dictionary_of, find_tags, opencv, rays
 from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario

@@ -22,7 +22,7 @@ from pydantic import model_validator
 
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.base.sections import Section
-from coopenv.cars.clock import CLOCK, Clock
+from coopenv.cars.link.clock import CLOCK, Clock
 
 
 class LinkError(CoopenvError):

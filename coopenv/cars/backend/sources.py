@@ -62,9 +62,9 @@ BAG = SourceKind(
 )
 DRIVE = SourceKind(
     title="a drive of cars, which --map opens as a bag",
-    opener="coopenv.cars.backend.drive:Drive",
+    opener="coopenv.cars.backend.recorded_drive:Drive",
     claims=is_drive,
     recorded=True,
     reader="coopenv.sources.sources:read_log",
 )
-IMAGES = SourceKind(title="rendered", claims=no_name, simulation="coopenv.cars.frames:Rendered")
+IMAGES = SourceKind(title="rendered", claims=no_name, simulation="coopenv.cars.fake.frames:Rendered")

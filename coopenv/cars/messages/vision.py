@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.base.files import muted_errors
 from coopenv.base.installation import install_command, needing
-from coopenv.cars.profile import IMAGES, VisionSettings
+from coopenv.cars.settings.profile import IMAGES, VisionSettings
 from coopenv.estimation.lens import distort, undistort
 from coopenv.estimation.poses import Array
 

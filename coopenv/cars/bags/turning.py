@@ -10,7 +10,7 @@ from scipy.ndimage import median_filter
 
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.bags.clocks import CAMERAS, azimuths_of
-from coopenv.cars.readings import Sample, Twist, tracks_of
+from coopenv.cars.messages.readings import Sample, Twist, tracks_of
 from coopenv.estimation.poses import Array
 
 TURNED = math.radians(10.0)  # of a car, by anything else than its turn rate
@@ -64,7 +64,7 @@ def constant_turn_rate(
     """Return what contradicts a turn rate as `turn_contradiction` does.
 
     Args:
-        tracks: of a car, see `coopenv.cars.readings.tracks_of`.
+        tracks: of a car, see `coopenv.cars.messages.readings.tracks_of`.
         sightings: times (n,), s, azimuths (n,), rad, in the body frame and positions (n, 2) of standing landmarks.
         wheelbase: of the car, m.
     """

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from coopenv.cars.calibration import Calibrated
+from coopenv.cars.calibration.calibrate import Calibrated
 from coopenv.viz import style
 
 MOST_ARROWS = 400

@@ -12,11 +12,11 @@ from pydantic import Field, field_validator
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.sections import PositiveVector2, Section, Vector2, read_toml, validated
-from coopenv.cars.profile import VELOCITY, Number, Role
+from coopenv.cars.settings.profile import VELOCITY, Number, Role
 
 if TYPE_CHECKING:
-    from coopenv.cars.readings import Twist
-    from coopenv.cars.vision import Calibration
+    from coopenv.cars.messages.readings import Twist
+    from coopenv.cars.messages.vision import Calibration
 
 Name = Annotated[str, Field(max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 TOPIC = r"^/[A-Za-z0-9_/~]{1,255}$"

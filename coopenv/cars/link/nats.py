@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import Any
 
 from coopenv.base.installation import install_command, needing
-from coopenv.cars.transport import (
+from coopenv.cars.link.transport import (
     Arrival,
     Callback,
     HeartbeatTransport,

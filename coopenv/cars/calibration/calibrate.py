@@ -18,7 +18,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import DataError, listed
-from coopenv.cars.calibration_batch import (
+from coopenv.cars.calibration.batch import (
     BIAS,
     CAMERA_TIME,
     LEVER,
@@ -31,7 +31,7 @@ from coopenv.cars.calibration_batch import (
     standard_errors,
     stated_rate,
 )
-from coopenv.cars.calibration_drives import CalibrationDrive, CarDrive
+from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive
 from coopenv.estimation.lens import PLUMB_BOB
 from coopenv.estimation.poses import Array, Mask
 

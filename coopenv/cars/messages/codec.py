@@ -8,8 +8,8 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, message_types, needing
-from coopenv.cars.profile import IMAGES, SVEA, CarProfile
-from coopenv.cars.transport import MOST_BYTES
+from coopenv.cars.link.transport import MOST_BYTES
+from coopenv.cars.settings.profile import IMAGES, SVEA, CarProfile
 
 TICK = "coopenv_msgs/msg/Tick"
 """Type of the marks in a file of a drive."""

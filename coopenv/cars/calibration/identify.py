@@ -8,13 +8,13 @@ import numpy as np
 from scipy.stats import ks_2samp
 
 from coopenv.base.errors import DataError, check_one_of
-from coopenv.cars.calibration import ConstantRow, tables_text
-from coopenv.cars.calibration_batch import deviation, stated_rate
+from coopenv.cars.calibration.batch import deviation, stated_rate
+from coopenv.cars.calibration.calibrate import ConstantRow, tables_text
+from coopenv.cars.calibration.response import DEAD_BAND, KINDS, Response, constants_of
 from coopenv.cars.fake.car import Sent, replay
 from coopenv.cars.fake.settings import USUAL, FakeSettings
-from coopenv.cars.profile import MotionCommand, Role
-from coopenv.cars.readings import CarPose, Detections, Sample, tracks_of
-from coopenv.cars.response import DEAD_BAND, KINDS, Response, constants_of
+from coopenv.cars.messages.readings import CarPose, Detections, Sample, tracks_of
+from coopenv.cars.settings.profile import MotionCommand, Role
 from coopenv.estimation.poses import Array
 from coopenv.scenario import load_scenario
 

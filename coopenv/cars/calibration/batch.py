@@ -29,7 +29,7 @@ from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import DataError
-from coopenv.cars.calibration_drives import CalibrationDrive, CarDrive, averaged
+from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive, averaged
 from coopenv.estimation.lens import COEFFICIENTS, distort, largest_radius
 from coopenv.estimation.poses import Array, Mask, skew
 from coopenv.scenario import Scenario
