@@ -31,7 +31,8 @@ from coopenv.cars.fake.fleet import free_port
 from coopenv.cars.fake.lockstep import Hub
 from coopenv.cars.link.zenoh import open_zenoh
 from coopenv.cars.messages.codec import encode, header, make
-from coopenv.cars.settings.profile import SVEA, USUAL, Role
+from coopenv.cars.settings.limits import USUAL
+from coopenv.cars.settings.profile import SVEA, Role
 from coopenv.cli.app import app
 from coopenv.estimation.observability import Trajectory
 from coopenv.runs.command import execute, report

@@ -7,11 +7,14 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.gate.gate import ARM, BOOL, COMMAND, STATUS, GateMode, Malformed, Reason, read, write, write_drive
+from coopenv.cars.gate.gate import ARM, BOOL, COMMAND, STATUS, GateMode, Reason
+from coopenv.cars.gate.wheel_command import NEUTRAL, write_drive
 from coopenv.cars.link.clock import CLOCK, Clock
 from coopenv.cars.link.keys import Signer, Verifier
 from coopenv.cars.link.transport import MOST_BYTES, Arrival, Transport
-from coopenv.cars.settings.profile import NEUTRAL, SVEA, CarProfile, Limits, Role
+from coopenv.cars.messages.cdr import Malformed, read, write
+from coopenv.cars.settings.limits import Limits
+from coopenv.cars.settings.profile import SVEA, CarProfile, Role
 
 MOST_WAITING = 256
 """Messages of one topic that wait for the next tick; older ones are dropped, so that a flood fills nothing."""

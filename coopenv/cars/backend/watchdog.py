@@ -16,7 +16,8 @@ from coopenv.cars.backend.station import BYPASSED, OLD, OPEN, Gates, Station
 from coopenv.cars.gate.gate import Reason
 from coopenv.cars.messages.readings import CarPose, Sample
 from coopenv.cars.settings.deployment import Safety
-from coopenv.cars.settings.profile import Role, inside, presence_of
+from coopenv.cars.settings.limits import inside
+from coopenv.cars.settings.profile import Role, presence_of
 from coopenv.estimation.poses import Array, skew
 from coopenv.observers.contract import Message
 from coopenv.sources.base import VehicleBroadcast

@@ -29,7 +29,7 @@ from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TRUTH, Chosen, ClockSettings, MapFrame, TopicMap, select
 from coopenv.cars.bags.topics import NS, TopicRow, regularity, unread_truth
 from coopenv.cars.bags.turning import turn_contradiction
-from coopenv.cars.gate.gate import read_drive
+from coopenv.cars.gate.wheel_command import read_drive
 from coopenv.cars.messages.codec import encode, stamp_of
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist, Value, read
 from coopenv.cars.messages.vision import Calibration

@@ -13,14 +13,13 @@ from coopenv.base.errors import CoopenvError, DataError, check_one_of, listed, s
 from coopenv.base.sections import Section, read_toml, validated, with_tables
 from coopenv.cars.messages.readings import READERS
 from coopenv.cars.settings.deployment import Car, Marker, refuse_repeated
+from coopenv.cars.settings.limits import Number, Positive
 from coopenv.cars.settings.profile import (
     AUTHORS,
     PREFIX,
     SVEA,
     VELOCITY,
     CarProfile,
-    Number,
-    Positive,
     Role,
     VisionSettings,
     load_profile,

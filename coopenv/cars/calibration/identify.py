@@ -13,8 +13,9 @@ from coopenv.cars.calibration.calibrate import ConstantRow, tables_text
 from coopenv.cars.calibration.response import DEAD_BAND, KINDS, Response, constants_of
 from coopenv.cars.fake.car import Sent, replay
 from coopenv.cars.fake.settings import USUAL, FakeSettings
+from coopenv.cars.gate.wheel_command import MotionCommand
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, tracks_of
-from coopenv.cars.settings.profile import MotionCommand, Role
+from coopenv.cars.settings.profile import Role
 from coopenv.estimation.poses import Array
 from coopenv.scenario import load_scenario
 

@@ -1,7 +1,7 @@
 """The gate on a car's own computer: the only process that commands the wheels.
 
-These are its decisions, without threads, clocks or a network of its own, and its few messages as CDR; process.py
-connects it to the network. It starts quickly and needs neither NumPy nor the simulation.
+These are its decisions, without threads, clocks or a network of its own; process.py connects it to the network. It
+starts quickly and needs neither NumPy nor the simulation.
 
 It starts disarmed. An arming by the station names a session and the nonce that the gate has shown last; the nonce is a
 new one after every start, arming, disarming and stop, so that an arming counts once, and only if its sender knew of
@@ -18,104 +18,16 @@ is a car that stands. Its `false` does nothing.
 
 import math
 import secrets
-import struct
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
 
-from coopenv.base.errors import CoopenvError
+from coopenv.cars.gate.wheel_command import NEUTRAL, MotionCommand, write_drive
 from coopenv.cars.link.keys import Verifier, is_identity
-from coopenv.cars.settings.profile import NEUTRAL, SVEA, CarProfile, CommandMessage, Limits, MotionCommand, Role
-
-ENCAPSULATION = b"\0\1\0\0"
-LONGEST_PADDING = 3  # bytes after the last field, which some writers add
-STAMP, TEXT = "S", "T"  # ns; UTF-8
-LIST = "[]"  # after a kind: any number of it
-KINDS = {
-    **{"bool": "?", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H"},
-    **{"int32": "i", "uint32": "I", "float32": "f", "float64": "d"},
-}
-"""Kinds of the module struct by type of ROS."""
-
-
-class Malformed(CoopenvError):  # noqa: N818
-    """Bytes are not the message that they should be."""
-
-
-def read(payload: bytes, fields: Iterable[str]) -> list[Any]:
-    """Return the fields of CDR bytes: kinds of the module struct, `STAMP` or `TEXT`, or a `LIST` of one.
-
-    Raises Malformed: the bytes are no such fields.
-    """
-    if payload[:2] != ENCAPSULATION[:2] or len(payload) < len(ENCAPSULATION):
-        raise Malformed("no little-endian CDR")
-    body, place = payload[len(ENCAPSULATION) :], 0
-
-    def number(kind: str) -> Any:
-        nonlocal place
-        size = struct.calcsize(kind)
-        start = -(-place // size) * size
-        place = start + size
-        if place > len(body):
-            raise Malformed("too short")
-        return struct.unpack_from(f"<{kind}", body, start)[0]
-
-    def value(field: str) -> Any:
-        nonlocal place
-        if field == STAMP:
-            seconds, nanoseconds = number("i"), number("I")
-            if nanoseconds >= 10**9:
-                raise Malformed("a stamp has more than a second of nanoseconds")
-            return seconds * 10**9 + nanoseconds
-        if field != TEXT:
-            return number(field)
-        length = number("I")  # with the zero byte at its end
-        raw = body[place : place + length]
-        place += length
-        if len(raw) != length or raw[-1:] != b"\0":
-            raise Malformed("a text has no end")
-        try:
-            return raw[:-1].decode()
-        except UnicodeDecodeError:
-            raise Malformed("a text is not UTF-8") from None
-
-    found = list[Any]()
-    for field in fields:
-        kind = field.removesuffix(LIST)
-        found.append(value(kind) if kind == field else [value(kind) for _ in range(number("I"))])
-    if len(body) - place > LONGEST_PADDING:
-        raise Malformed("too long")
-    return found
-
-
-def write(fields: Iterable[str], *values: Any) -> bytes:
-    """Return the CDR bytes of values; fields as for `read`."""
-    body = bytearray()
-
-    def put(kind: str, value: float) -> None:
-        body.extend(bytes(-len(body) % struct.calcsize(kind)) + struct.pack(f"<{kind}", value))
-
-    def add(field: str, value: Any) -> None:
-        if field == STAMP:
-            for kind, part in zip("iI", divmod(value, 10**9), strict=True):
-                put(kind, part)
-        elif field == TEXT:
-            raw = value.encode() + b"\0"
-            put("I", len(raw))
-            body.extend(raw)
-        else:
-            put(field, value)
-
-    for field, value in zip(fields, values, strict=True):
-        kind = field.removesuffix(LIST)
-        if kind != field:
-            put("I", len(value))
-        for each in value if kind != field else (value,):
-            add(kind, each)
-    return ENCAPSULATION + bytes(body)
-
+from coopenv.cars.messages.cdr import LIST, STAMP, TEXT, Malformed, read, write
+from coopenv.cars.settings.limits import Limits
+from coopenv.cars.settings.profile import SVEA, CarProfile, Role
 
 COMMAND = (STAMP, TEXT, *"fffff")
 """AckermannDriveStamped: steering rad, its rate rad/s, speed m/s, acceleration m/s^2, jerk m/s^3."""
@@ -124,20 +36,6 @@ ARM = (STAMP, TEXT, TEXT, TEXT, "?")
 BOOL = ("?",)
 STATUS = (STAMP, *[TEXT] * 4, *"QQ", TEXT + LIST, "Q" + LIST)
 """GateStatus: frame, session, nonce, state, accepted commands, last sequence number, reasons of refusals and counts."""
-
-
-def write_drive(stamp: int, message: CommandMessage, drive: MotionCommand) -> bytes:
-    """Return the message from the gate to the car for a finite command, with a stamp in ns."""
-    kinds, values = [kind for kind, _ in message.neutral.values()], message.values(drive).values()
-    numbers = [v if kind.startswith("float") else int(v) for kind, v in zip(kinds, values, strict=True)]
-    return write((STAMP, TEXT, *(KINDS[kind] for kind in kinds)), stamp, "", *numbers)
-
-
-def read_drive(payload: bytes, message: CommandMessage) -> MotionCommand:
-    """Return the command in a message from a gate to its car. Raises Malformed: the bytes are none."""
-    kinds = [KINDS[kind] for kind, _ in message.neutral.values()]
-    _, _, *values = read(payload, (STAMP, TEXT, *kinds))
-    return message.drive(dict(zip(message.neutral, values, strict=True)))
 
 
 class GateMode(StrEnum):

@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.gate.gate import PERIOD, Gate, GateClock, GateMode, Malformed, read_drive, write
+from coopenv.cars.gate.gate import PERIOD, Gate, GateClock, GateMode
+from coopenv.cars.gate.wheel_command import NEUTRAL, read_drive
 from coopenv.cars.link.keys import Signer, check_identity, load_keys
 from coopenv.cars.link.transport import SECURE, Arrival, Transport, address_of
+from coopenv.cars.messages.cdr import Malformed, write
 from coopenv.cars.settings.deployment import Car, Deployment, load_deployment
-from coopenv.cars.settings.profile import NEUTRAL, Role, presence_of
+from coopenv.cars.settings.profile import Role, presence_of
 
 TICKS_PER_STATUS = 4  # 5 Hz
 LAST_NEUTRALS = 5  # that the car gets before the gate goes

@@ -24,7 +24,7 @@ from typing import Any
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import needing
-from coopenv.cars.gate.gate import read_drive
+from coopenv.cars.gate.wheel_command import CommandMessage, MotionCommand, read_drive
 from coopenv.cars.link.transport import (
     Address,
     Arrival,
@@ -38,7 +38,7 @@ from coopenv.cars.link.transport import (
 )
 from coopenv.cars.messages.codec import cdr_of, decode, encode, make, ros1, ros1_of
 from coopenv.cars.settings.deployment import Car, DeploymentError
-from coopenv.cars.settings.profile import AUTHORS, SVEA, CarProfile, CommandMessage, MotionCommand, Role
+from coopenv.cars.settings.profile import AUTHORS, SVEA, CarProfile, Role
 
 PER_PERCENT = 1.27  # of the whole numbers of lli_ctrl
 DEAD_BAND = 15.0  # % of the speed controller's range about zero in which the wheels do not turn

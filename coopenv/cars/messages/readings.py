@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError, listed, shown
+from coopenv.cars.gate.wheel_command import MotionCommand
 from coopenv.cars.messages.codec import numbers_after_header
 from coopenv.cars.messages.vision import BEARINGS, FINDERS, Calibration, Tag
-from coopenv.cars.settings.profile import GATE_TYPES, MOST_CHANNELS, CarProfile, MotionCommand, Role, VisionSettings
+from coopenv.cars.settings.profile import GATE_TYPES, MOST_CHANNELS, CarProfile, Role, VisionSettings
 from coopenv.estimation.poses import Array, log_so3
 from coopenv.observers.contract import Message
 from coopenv.scenario import sensing

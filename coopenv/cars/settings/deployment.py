@@ -13,21 +13,10 @@ from coopenv.base.sections import Section, read_toml, validated, with_tables
 from coopenv.cars.fake.settings import USUAL as DEFAULT_FAKE
 from coopenv.cars.fake.settings import FakeSettings
 from coopenv.cars.gate.gate import TIMEOUT
+from coopenv.cars.gate.wheel_command import CommandMessage
 from coopenv.cars.link.transport import SECURE, UNIX, Tls, address_of
-from coopenv.cars.settings.profile import (
-    MOST_CHANNELS,
-    SVEA,
-    USUAL,
-    CarProfile,
-    CommandMessage,
-    Limits,
-    Number,
-    Point,
-    Positive,
-    RemotePulses,
-    is_simple,
-    load_profile,
-)
+from coopenv.cars.settings.limits import USUAL, Limits, Number, Point, Positive, is_simple
+from coopenv.cars.settings.profile import MOST_CHANNELS, SVEA, CarProfile, RemotePulses, load_profile
 from coopenv.cars.settings.sensors import Name, Sensors, read_calibration
 
 Endpoint = Annotated[str, AfterValidator(lambda text: address_of(text) and text)]  # such as tcp/127.0.0.1:7447

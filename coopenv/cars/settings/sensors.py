@@ -12,7 +12,8 @@ from pydantic import Field, field_validator
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.sections import PositiveVector2, Section, Vector2, read_toml, validated
-from coopenv.cars.settings.profile import VELOCITY, Number, Role
+from coopenv.cars.settings.limits import Number
+from coopenv.cars.settings.profile import VELOCITY, Role
 
 if TYPE_CHECKING:
     from coopenv.cars.messages.readings import Twist

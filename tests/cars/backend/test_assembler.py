@@ -11,11 +11,12 @@ import pytest
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.assembler import Assembler, Intake, TopicClock
-from coopenv.cars.backend.binding import Binding, bind, estimate_message, report_message
+from coopenv.cars.backend.binding import Binding, bind
 from coopenv.cars.backend.buffers import LONGEST_GAP, PoseTrack
 from coopenv.cars.link.transport import Arrival
 from coopenv.cars.messages.codec import decode, encode, header, make
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.messages.v2x import estimate_message, report_message
 from coopenv.cars.settings.deployment import Car, Sensors
 from coopenv.cars.settings.profile import SVEA, Role
 from coopenv.estimation.poses import exp_so3

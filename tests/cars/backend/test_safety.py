@@ -23,7 +23,8 @@ from coopenv.cars.messages.codec import encode, header, make
 from coopenv.cars.messages.readings import CarPose, Sample, Twist
 from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.deployment import Remote, Safety
-from coopenv.cars.settings.profile import SVEA, USUAL, Role
+from coopenv.cars.settings.limits import USUAL
+from coopenv.cars.settings.profile import SVEA, Role
 from coopenv.estimation.poses import exp_so3
 from coopenv.sources.base import VehicleBroadcast
 from tests.cars.backend.test_assembler import binding

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import coopenv
-from coopenv.cars.gate.gate import read_drive
+from coopenv.cars.gate.wheel_command import read_drive
 from coopenv.cars.link.transport import Arrival
 from coopenv.cars.link.zenoh import open_zenoh
 from coopenv.cars.messages.codec import decode

@@ -16,8 +16,8 @@ import coopenv
 from coopenv.cars.backend.backend import Svea
 from coopenv.cars.fake.fleet import FakesError, prepare_fake
 from coopenv.cars.fake.lockstep import Hub, LockstepFakes
-from coopenv.cars.gate.gate import read_drive
 from coopenv.cars.gate.process import GateConnection, prepare_gate
+from coopenv.cars.gate.wheel_command import read_drive
 from coopenv.cars.link.clock import SimulatedClock
 from coopenv.cars.link.transport import Arrival
 from coopenv.cars.settings.deployment import Safety, load_deployment

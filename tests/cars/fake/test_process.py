@@ -26,14 +26,16 @@ from coopenv.cars.commands.svea import next_message
 from coopenv.cars.fake.fleet import FakesError, free_port
 from coopenv.cars.fake.fleet import fakes as fake_processes
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.gate.gate import STATUS, write
+from coopenv.cars.gate.gate import STATUS
 from coopenv.cars.link.clock import SimulatedClock
 from coopenv.cars.link.keys import load_signer, load_verifier, make_keys
 from coopenv.cars.link.transport import Arrival
 from coopenv.cars.link.zenoh import open_zenoh
+from coopenv.cars.messages.cdr import write
 from coopenv.cars.messages.codec import MOST_BYTES, encode, make
 from coopenv.cars.settings.deployment import DeploymentError, Safety, load_deployment
-from coopenv.cars.settings.profile import SVEA, Limits, Role, presence_of
+from coopenv.cars.settings.limits import Limits
+from coopenv.cars.settings.profile import SVEA, Role, presence_of
 from coopenv.cli.app import app
 from tests.helpers.cars import OVERTAKING, open_fake, write_fleet
 from tests.helpers.processes import ROOT, mentioning, start, wait_until

@@ -13,11 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.gate.gate import read_drive, write_drive
+from coopenv.cars.gate.wheel_command import NEUTRAL, MotionCommand, read_drive, write_drive
 from coopenv.cars.link.ros1 import low_level
 from coopenv.cars.link.transport import matcher
 from coopenv.cars.messages.codec import MOST_BYTES, cdr_of, decode, encode, header, make, ros1, ros1_of, ros2, stamp_of
-from coopenv.cars.settings.profile import NEUTRAL, SVEA, Limits, MotionCommand, Role, presence_of
+from coopenv.cars.settings.limits import Limits
+from coopenv.cars.settings.profile import SVEA, Role, presence_of
 
 ENCAPSULATION = bytes.fromhex("00010000")
 MANUAL = "mavros_msgs/msg/ManualControl"

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.cars.gate.gate import write_drive
+from coopenv.cars.gate.wheel_command import MotionCommand, write_drive
 from coopenv.cars.link.transport import Arrival
 from coopenv.cars.messages import codec
-from coopenv.cars.settings.profile import SVEA, CarProfile, MotionCommand, Role, load_profile
+from coopenv.cars.settings.profile import SVEA, CarProfile, Role, load_profile
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 
 pytest.importorskip("cyclonedds", reason="needs cyclonedds, which has no wheel for this platform")

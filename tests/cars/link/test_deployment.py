@@ -14,13 +14,15 @@ from coopenv.cars.backend.assembler import Intake
 from coopenv.cars.backend.station import Gates
 from coopenv.cars.bags.topic_map import load_map, patterns_of
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.gate.gate import PERIOD, Gate, GateClock, read_drive, write_drive
+from coopenv.cars.gate.gate import PERIOD, Gate, GateClock
 from coopenv.cars.gate.process import GateConnection
+from coopenv.cars.gate.wheel_command import MotionCommand, read_drive, write_drive
 from coopenv.cars.link.transport import Arrival
 from coopenv.cars.messages.codec import decode
 from coopenv.cars.messages.readings import check_types
 from coopenv.cars.settings.deployment import DeploymentError, Remote, load_deployment
-from coopenv.cars.settings.profile import FOLDER, SVEA, USUAL, CarProfile, MotionCommand, Role, load_profile
+from coopenv.cars.settings.limits import USUAL
+from coopenv.cars.settings.profile import FOLDER, SVEA, CarProfile, Role, load_profile
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 
 GOOD = """

@@ -16,12 +16,13 @@ import pytest
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.station import OLD, Gates, neutral_command
 from coopenv.cars.gate.attack import Intruder, attack
-from coopenv.cars.gate.gate import write_drive
+from coopenv.cars.gate.wheel_command import MotionCommand, write_drive
 from coopenv.cars.link.keys import load_signer, make_keys
 from coopenv.cars.link.transport import Tls
 from coopenv.cars.link.zenoh import Zenoh, open_zenoh
 from coopenv.cars.settings.deployment import parse_deployment
-from coopenv.cars.settings.profile import SVEA, USUAL, MotionCommand, Role
+from coopenv.cars.settings.limits import USUAL
+from coopenv.cars.settings.profile import SVEA, Role
 from tests.cars.link.gate.bench import CAR
 from tests.cars.link.gate.station import Station, running_gate
 from tests.helpers.brokers import Authority

@@ -9,10 +9,12 @@ from typing import Any
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from coopenv.cars.gate.gate import PERIOD, Gate, GateClock, Reason, read_drive
+from coopenv.cars.gate.gate import PERIOD, Gate, GateClock, Reason
+from coopenv.cars.gate.wheel_command import MotionCommand, read_drive
 from coopenv.cars.link.keys import Signer, Verifier
 from coopenv.cars.messages.codec import decode, stamp_of
-from coopenv.cars.settings.profile import SVEA, Limits, MotionCommand, Role
+from coopenv.cars.settings.limits import Limits
+from coopenv.cars.settings.profile import SVEA, Role
 from tests.cars.link.gate import messages
 
 CAR = "svea7"

@@ -8,11 +8,12 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any
 
-from coopenv.cars.gate.gate import Malformed, read_drive
+from coopenv.cars.gate.wheel_command import MotionCommand, read_drive
 from coopenv.cars.link.keys import Signer
 from coopenv.cars.link.transport import Transport
+from coopenv.cars.messages.cdr import Malformed
 from coopenv.cars.messages.codec import decode
-from coopenv.cars.settings.profile import SVEA, MotionCommand, Role, presence_of
+from coopenv.cars.settings.profile import SVEA, Role, presence_of
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR
 from tests.helpers.processes import COOPENV, started, wait_until

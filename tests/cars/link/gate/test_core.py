@@ -11,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.cars.gate.gate import MOST_AHEAD, TIMEOUT, GateMode, Reason
-from coopenv.cars.settings.profile import NEUTRAL, SVEA, Limits, MotionCommand, Role
+from coopenv.cars.gate.wheel_command import NEUTRAL, MotionCommand
+from coopenv.cars.settings.limits import Limits
+from coopenv.cars.settings.profile import SVEA, Role
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import LIMITS, MS, OTHER, STATION, Bench
 

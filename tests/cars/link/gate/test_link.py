@@ -16,23 +16,13 @@ from hypothesis import strategies as st
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.gate.gate import (
-    ARM,
-    BOOL,
-    COMMAND,
-    STATUS,
-    Gate,
-    GateMode,
-    Malformed,
-    Reason,
-    read,
-    write,
-    write_drive,
-)
+from coopenv.cars.gate.gate import ARM, BOOL, COMMAND, STATUS, Gate, GateMode, Reason
 from coopenv.cars.gate.process import GateConnection, run
+from coopenv.cars.gate.wheel_command import NEUTRAL, MotionCommand, write_drive
 from coopenv.cars.link.clock import CLOCK
+from coopenv.cars.messages.cdr import Malformed, read, write
 from coopenv.cars.messages.codec import decode, encode, header, make
-from coopenv.cars.settings.profile import NEUTRAL, SVEA, MotionCommand, Role
+from coopenv.cars.settings.profile import SVEA, Role
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR, LIMITS, OTHER, STATION, Bench, messages_of_strangers
 from tests.cars.link.gate.messages import arm, framed_command, stop

@@ -17,9 +17,10 @@ from random import Random
 
 import pytest
 
+from coopenv.cars.gate.wheel_command import NEUTRAL
 from coopenv.cars.link.keys import load_signer, load_verifier, make_keys
 from coopenv.cars.link.zenoh import LEASE, open_zenoh
-from coopenv.cars.settings.profile import NEUTRAL, Role
+from coopenv.cars.settings.profile import Role
 from coopenv.cli.app import main
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR, messages_of_strangers
