@@ -12,7 +12,7 @@ from coopenv.cars.gate.wheel_command import NEUTRAL, Brake, MotionCommand, read_
 from coopenv.cars.settings.deployment import Safety
 from coopenv.cars.settings.limits import Limits
 from coopenv.cars.settings.profile import SVEA, CarProfile, Role
-from tests.cars.link.gate import messages
+from tests.cars.gate import messages
 from tests.helpers.env_suite import rest_slow
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 

@@ -23,10 +23,10 @@ from coopenv.cars.link.clock import CLOCK
 from coopenv.cars.messages.cdr import Malformed, read, write
 from coopenv.cars.messages.codec import decode, encode, header, make
 from coopenv.cars.settings.profile import SVEA, Role
-from tests.cars.link.gate import messages
-from tests.cars.link.gate.bench import CAR, LIMITS, OTHER, STATION, Bench, messages_of_strangers
-from tests.cars.link.gate.messages import arm, framed_command, stop
-from tests.cars.link.gate.station import Station
+from tests.cars.gate import messages
+from tests.cars.gate.bench import CAR, LIMITS, OTHER, STATION, Bench, messages_of_strangers
+from tests.cars.gate.messages import arm, framed_command, stop
+from tests.cars.gate.station import Station
 
 
 class Broken(Gate):

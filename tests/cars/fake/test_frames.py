@@ -19,7 +19,7 @@ from coopenv.scenario import Scenario, parse_scenario
 from coopenv.sources.base import Command
 from coopenv.sources.sources import simulation_of
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "rendered_frames.toml"
+EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "rendered_frames.toml"
 CAMERA = {
     **{"model": "pinhole", "position": [0.3, 0.0, 0.3], "image_size": [320, 240], "principal_point": [161.0, 118.0]},
     **{"focal_length": [225.0, 227.0], "distortion": [-0.3, 0.1, 0.002, 0.0006, 0.0]},

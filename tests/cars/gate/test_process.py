@@ -22,9 +22,9 @@ from coopenv.cars.link.keys import load_signer, load_verifier, make_keys
 from coopenv.cars.link.zenoh import LEASE, open_zenoh
 from coopenv.cars.settings.profile import Role
 from coopenv.cli.app import main
-from tests.cars.link.gate import messages
-from tests.cars.link.gate.bench import CAR, messages_of_strangers
-from tests.cars.link.gate.station import Station, running_gate
+from tests.cars.gate import messages
+from tests.cars.gate.bench import CAR, messages_of_strangers
+from tests.cars.gate.station import Station, running_gate
 from tests.helpers.processes import COOPENV, ROOT, started, wait_until
 from tests.helpers.wire import free_endpoint, heard_by, running
 
@@ -275,7 +275,7 @@ def test_it_loads_neither_the_simulation_nor_numpy() -> None:
 
 @pytest.mark.parametrize("command", ["gate", "health"])
 def test_a_car_needs_only_the_packages_of_its_group(command: str) -> None:
-    root = Path(__file__).resolve().parents[4]
+    root = Path(__file__).resolve().parents[3]
     with (root / "pyproject.toml").open("rb") as file:
         project = tomllib.load(file)
     needed, small = project["project"]["dependencies"], project["dependency-groups"]["gate"]

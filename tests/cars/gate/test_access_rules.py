@@ -23,8 +23,8 @@ from coopenv.cars.link.zenoh import Zenoh, open_zenoh
 from coopenv.cars.settings.deployment import parse_deployment
 from coopenv.cars.settings.limits import USUAL
 from coopenv.cars.settings.profile import SVEA, Role
-from tests.cars.link.gate.bench import CAR
-from tests.cars.link.gate.station import Station, running_gate
+from tests.cars.gate.bench import CAR
+from tests.cars.gate.station import Station, running_gate
 from tests.helpers.brokers import Authority
 from tests.helpers.frames import BEARINGS, FLEET, FRAMES, grey_frame, seeing
 from tests.helpers.processes import COOPENV, ROOT, started, wait_until

@@ -15,7 +15,7 @@ from coopenv.cars.link.keys import Signer, Verifier
 from coopenv.cars.messages.codec import decode, stamp_of
 from coopenv.cars.settings.limits import Limits
 from coopenv.cars.settings.profile import SVEA, Role
-from tests.cars.link.gate import messages
+from tests.cars.gate import messages
 
 CAR = "svea7"
 KEYS = {name: Ed25519PrivateKey.from_private_bytes(bytes([i]) * 32) for i, name in enumerate(("station", CAR))}

@@ -14,8 +14,8 @@ from coopenv.cars.link.transport import Transport
 from coopenv.cars.messages.cdr import Malformed
 from coopenv.cars.messages.codec import decode
 from coopenv.cars.settings.profile import SVEA, Role, presence_of
-from tests.cars.link.gate import messages
-from tests.cars.link.gate.bench import CAR
+from tests.cars.gate import messages
+from tests.cars.gate.bench import CAR
 from tests.helpers.processes import COOPENV, started, wait_until
 from tests.helpers.wire import heard_by, seen_by
 

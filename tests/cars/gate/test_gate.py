@@ -14,8 +14,8 @@ from coopenv.cars.gate.gate import MOST_AHEAD, TIMEOUT, GateMode, Reason
 from coopenv.cars.gate.wheel_command import NEUTRAL, MotionCommand
 from coopenv.cars.settings.limits import Limits
 from coopenv.cars.settings.profile import SVEA, Role
-from tests.cars.link.gate import messages
-from tests.cars.link.gate.bench import LIMITS, MS, OTHER, STATION, Bench
+from tests.cars.gate import messages
+from tests.cars.gate.bench import LIMITS, MS, OTHER, STATION, Bench
 
 MOST_AGE = SVEA.topics[Role.COMMAND].max_age_ns
 
