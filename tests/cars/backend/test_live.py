@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -24,8 +23,11 @@ from coopenv.cars.fake.lockstep import Hub
 from coopenv.cars.link.transport import Arrival
 from coopenv.cars.messages.codec import encode, header, make
 from coopenv.cars.messages.readings import Twist
+from coopenv.cars.messages.v2x import report_message
 from coopenv.cars.settings.profile import RESET_TOPIC, SVEA, Role
-from tests.helpers.cars import OVERTAKING, PATIENT, SAFETY, cars, fakes, send_fault, threaded_fakes, write_fleet
+from coopenv.observers.contract import Message
+from coopenv.sources.base import VehicleBroadcast
+from tests.helpers.cars import OVERTAKING, SAFETY, cars, fakes, send_fault, write_fleet
 
 AHEAD = np.array([0.2, 0.0])  # 0.3 m/s of f1
 
@@ -156,47 +158,33 @@ def test_a_drive_that_is_none_is_refused(tmp_path: Path) -> None:
         Drive(tmp_path / "nowhere.mcap")
 
 
-@pytest.fixture
-def threads_of_cars(tmp_path: Path) -> Iterator[tuple[Path, Hub]]:
-    path = write_fleet(tmp_path, safety=PATIENT)
-    with threaded_fakes(path) as hub:
-        yield path, hub
+def test_a_station_of_one_car_receives_the_estimates_of_the_other(lab: Any) -> None:
+    """The leader's station is a repeated broadcast of its true pose."""
+    path, hub, made = lab
+    with closing(env_of(cars(path, hub, car="svea1"))) as env:
+        assert env.possible_agents == ["vehicle_2"]
+        station = hub.connect()
 
+        def broadcast() -> None:
+            R, p = made["svea7"].world.pose(made["svea7"].world.agent)
+            extra = {"odometry": np.zeros(6), "depends_on": np.zeros(1, np.uint64)}
+            covariance = 1e-4 * np.eye(6)
+            sent = VehicleBroadcast(0, R, p, covariance, Message(p, R, covariance, extra))
+            message = report_message(sent, hub.clock.wall(), np.zeros(3))
+            station.publish(SVEA.topic_of("svea7", Role.REPORT), encode(message))
 
-def test_one_car_each_hears_the_other(threads_of_cars: tuple[Path, Hub]) -> None:
-    """In real time: each station has a thread of its own."""
-    path, hub = threads_of_cars
-    backends = {car: cars(path, hub, car=car) for car in ("svea7", "svea1")}
-    envs = {car: env_of(backend) for car, backend in backends.items()}
-    assert [env.possible_agents for env in envs.values()] == [["vehicle_1"], ["vehicle_2"]]
-    results: dict[str, Any] = {}
-    mask = observation_layout(envs["svea7"].scenario)["message_mask"]
-    heard: dict[str, list[float]] = {car: [] for car in envs}
-
-    def live(car: str) -> None:
-        env = envs[car]
+        end = hub.clock.repeat(0.05, broadcast, "the other station")
+        mask = observation_layout(env.scenario)["message_mask"]
         env.reset(seed=3)
-        for _ in range(40):
-            observations, *_, results[car] = env.step(dict.fromkeys(env.agents, AHEAD))
-            heard[car] += [float(mask.values(row[None]).mean()) for row in observations.values()]
-
-    threads = [threading.Thread(target=live, args=(car,)) for car in envs]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    try:
-        info = results["svea1"]["vehicle_2"]
-        assert info["position_error"] < 0.3 and list(results["svea1"]) == ["vehicle_2"]
-        follower = envs["svea1"].engine
-        leader = envs["svea7"].engine
-        assert int(follower.view("inbox_tick")[0, 1, 0]) > 0  # how late depends on how the threads are scheduled
-        assert np.mean(heard["svea1"]) > 0.0 and np.mean(heard["svea7"]) == 0.0  # f1 leads, and hears nobody
-        heard, own = (engine.view("estimate_rotation")[0, 0] for engine in (follower, leader))
-        np.testing.assert_allclose(heard, own, atol=0.05)
-    finally:
-        for env in envs.values():
-            env.close()
+        received = list[float]()
+        for _ in range(20):
+            observations, *_, infos = env.step(dict.fromkeys(env.agents, AHEAD))
+            received.append(float(mask.values(observations["vehicle_2"][None]).mean()))
+        end()
+        assert list(infos) == ["vehicle_2"] and infos["vehicle_2"]["position_error"] < 0.3
+        assert np.mean(received) > 0.0 and int(env.engine.view("inbox_tick")[0, 1, 0]) > 0
+        of_leader = env.engine.view("estimate_rotation")[0, 0]
+        np.testing.assert_allclose(of_leader, made["svea7"].world.pose(made["svea7"].world.agent)[0], atol=0.05)
 
 
 def refuses(path: Path, hub: Hub, why: str, car: str | None = None) -> None:

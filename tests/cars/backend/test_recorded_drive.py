@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import struct
-import sys
 import threading
 import warnings
 from collections import Counter
@@ -36,7 +36,7 @@ from coopenv.sources.base import Command
 from coopenv.sources.mcap import read_recording
 from coopenv.sources.registry import kind_of
 from tests.helpers.cars import cars, fakes, write_fleet
-from tests.helpers.processes import DEADLOCK, start
+from tests.helpers.processes import wait_until
 
 WHEEL, FRAMES = SVEA.topic_of("svea7", Role.WHEEL), SVEA.topic_of("svea7", Role.DETECTIONS)
 TYPES = {WHEEL: SVEA.topics[Role.WHEEL].type, FRAMES: SVEA.topics[Role.DETECTIONS].type}
@@ -76,7 +76,7 @@ def test_rosbags_reads_it_as_a_bag_of_ros_2(written: Path) -> None:
     assert (first.index, first.key, first.episode) == (0, 2**64 - 1, 3)
 
 
-def test_what_goes_out_comes_aside_or_is_there_is_on_tape(tmp_path: Path) -> None:
+def test_messages_that_are_sent_or_set_aside_and_presences_are_recorded(tmp_path: Path) -> None:
     hub, heard, read = Hub(), [], []
     hub.connect().subscribe(WHEEL, heard.append)
     state, stop, wheels = (SVEA.topic_of("svea7", role) for role in (Role.STATE, Role.STOP, Role.WHEEL))
@@ -118,7 +118,7 @@ def test_what_goes_out_comes_aside_or_is_there_is_on_tape(tmp_path: Path) -> Non
     assert [m.data for topic, m in messages if topic == "/fleet/alive/svea7"] == [True, False]
 
 
-def test_threads_write_what_they_like_and_the_order_of_each_is_kept(tmp_path: Path) -> None:
+def test_the_order_of_each_thread_is_kept(tmp_path: Path) -> None:
     recorder, each, writers = DriveRecorder(tmp_path / "drive.mcap", b"{}", TYPES), 500, 4
     frame = encode(make(TYPES[FRAMES]))
 
@@ -143,37 +143,6 @@ def test_threads_write_what_they_like_and_the_order_of_each_is_kept(tmp_path: Pa
     assert [time for topic, time in found if topic == f"/{TICK_TOPIC}"] == [1, *range(1, each)]
 
 
-WRITER = f"""
-import os, resource, sys, time
-from pathlib import Path
-from coopenv.cars.backend.recorded_drive import FLUSH, DriveRecorder
-from coopenv.cars.messages.codec import encode
-from coopenv.cars.messages.codec import make
-recorder = DriveRecorder(Path("drive.mcap"), b"{{}}", {{"frames": "{TYPES[FRAMES]}"}})
-recorder.tick(0, 1)
-frame = encode(make("{TYPES[FRAMES]}"))
-"""
-KILLED = """
-recorder.write("frames", frame, 2)
-time.sleep(4 * FLUSH)
-recorder.tick(1, 3)
-recorder.stopped("sent at once", "", 4)
-time.sleep(0.3)
-os.kill(os.getpid(), 9)
-"""
-FULL = """
-import os
-resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
-for k in range(1500):
-    recorder.write("frames", frame + os.urandom(300), k)
-    time.sleep(0.001)
-try:
-    recorder.close()
-except Exception as error:
-    print(type(error).__name__, error)
-"""
-
-
 def whole(path: Path) -> list[tuple[str, int]]:
     """Return topic and time of the messages that the library finds in a file before it comes upon its end."""
     channels, found = {}, []
@@ -186,22 +155,53 @@ def whole(path: Path) -> list[tuple[str, int]]:
     return found
 
 
-def test_who_is_killed_leaves_what_came_before_the_last_flush(tmp_path: Path) -> None:
-    process = start((sys.executable, "-c", WRITER + KILLED), tmp_path)
-    assert process.wait(DEADLOCK) == -9
-    expected = [(f"/{TICK_TOPIC}", 1), ("/frames", 2), (f"/{TICK_TOPIC}", 3), (f"/{STOPPED_TOPIC}", 4)]
-    assert whole(tmp_path / "drive.mcap") == expected
+@pytest.fixture
+def recorder(tmp_path: Path) -> DriveRecorder:
+    made = DriveRecorder(tmp_path / "drive.mcap", b"{}", TYPES)
+    made.tick(0, 1)
+    return made
 
 
-def test_a_full_disk_is_one_line_and_what_is_written_can_be_read(tmp_path: Path) -> None:
-    process = start((sys.executable, "-c", WRITER + FULL), tmp_path)
-    printed, errors = process.communicate(timeout=DEADLOCK)
-    assert printed == "OutputError cannot write to drive.mcap: File too large\n", errors
-    frames = [time for topic, time in whole(tmp_path / "drive.mcap") if topic == "/frames"]
-    assert 0 < len(frames) < 1500 and frames == [*range(len(frames))]
+def test_records_reach_the_file_without_an_end_and_a_stop_at_once(
+    recorder: DriveRecorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that is killed loses what came after the last flush, and no stop."""
+    found: list[tuple[str, int]] = []
+
+    def has(*last: tuple[str, int]) -> bool:
+        found[:] = whole(tmp_path / "drive.mcap")
+        return found[-len(last) :] == [*last]
+
+    recorder.write(FRAMES, encode(make(TYPES[FRAMES])), 2)
+    wait_until(lambda: has((f"/{TICK_TOPIC}", 1), (f"/{FRAMES}", 2)))
+    monkeypatch.setattr("coopenv.cars.backend.recorded_drive.FLUSH", 1e6)
+    recorder.tick(1, 3)
+    recorder.stopped("sent at once", "", 4)
+    wait_until(lambda: has((f"/{FRAMES}", 2), (f"/{TICK_TOPIC}", 3), (f"/{STOPPED_TOPIC}", 4)))
+    recorder.close()
 
 
-def test_without_an_episode_there_is_nothing_to_keep(tmp_path: Path) -> None:
+def test_a_full_disk_is_one_line_and_the_written_part_can_be_read(
+    recorder: DriveRecorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flush, flushed = recorder._writer.flush, list[bool]()
+
+    def full() -> None:
+        if flushed:
+            raise OSError(errno.EFBIG, "File too large")
+        flush()
+        flushed.append(True)
+
+    monkeypatch.setattr(recorder._writer, "flush", full)
+    recorder.stopped("written", "", 2)
+    wait_until(lambda: flushed)
+    recorder.stopped("lost", "", 3)
+    with pytest.raises(OutputError, match=r"^cannot write to .*drive\.mcap: File too large$"):
+        recorder.close()
+    assert whole(tmp_path / "drive.mcap") == [(f"/{TICK_TOPIC}", 1), (f"/{STOPPED_TOPIC}", 2)]
+
+
+def test_a_file_without_an_episode_is_removed(tmp_path: Path) -> None:
     recorder = DriveRecorder(tmp_path / "drive.mcap", b"{}", TYPES)
     recorder.write(FRAMES, encode(make(TYPES[FRAMES])), 1)
     recorder.close()
@@ -212,7 +212,7 @@ def test_without_an_episode_there_is_nothing_to_keep(tmp_path: Path) -> None:
     ("name", "why"),
     [("a.bag", r"must end in \.mcap"), ("no/drive.mcap", "cannot write to"), ("drive.mcap", "exists already")],
 )
-def test_where_none_can_be_written_is_said_and_nothing_is_overwritten(written: Path, name: str, why: str) -> None:
+def test_a_path_that_cannot_be_written_is_named_and_nothing_is_overwritten(written: Path, name: str, why: str) -> None:
     before = written.read_bytes()
     with pytest.raises(OutputError, match=why):
         DriveRecorder(written.parent / name, b"{}", TYPES)
@@ -261,7 +261,7 @@ def ticks_of(path: Path) -> list[Any]:
             return ticks
 
 
-def test_what_explains_a_stop_is_on_the_tape(recorded: Any) -> None:
+def test_the_messages_that_explain_a_stop_are_recorded(recorded: Any) -> None:
     messages = messages_of(recorded[0])
     counts = Counter(topic for topic, _ in messages)
     for car in ("svea7", "svea1"):
@@ -275,7 +275,7 @@ def test_what_explains_a_stop_is_on_the_tape(recorded: Any) -> None:
     assert (reason, car) == (REASON, "svea7")
 
 
-def test_a_replay_says_what_the_live_run_said(recorded: Any, tmp_path: Path) -> None:
+def test_a_replay_reports_what_the_live_run_reported(recorded: Any, tmp_path: Path) -> None:
     path, printed, live = recorded
     assert f"Stopped: {REASON}" in printed
     backend = Drive(path)
@@ -293,7 +293,7 @@ def test_a_replay_says_what_the_live_run_said(recorded: Any, tmp_path: Path) -> 
     assert "ended before its time" in result["outcome"]
 
 
-def test_of_a_drive_that_is_cut_off_what_is_whole_is_replayed(recorded: Any, tmp_path: Path) -> None:
+def test_the_whole_part_of_a_drive_that_is_cut_off_is_replayed(recorded: Any, tmp_path: Path) -> None:
     data, all_ticks = recorded[0].read_bytes(), ticks_of(recorded[0])
     numbers = []
     for size in np.linspace(4000, len(data) - 1, 8).astype(int).tolist():
@@ -323,7 +323,7 @@ def test_of_a_drive_that_is_cut_off_what_is_whole_is_replayed(recorded: Any, tmp
     assert len(set(numbers)) > 3
 
 
-def test_where_the_disk_holds_nonsense_the_drive_ends(recorded: Any, tmp_path: Path) -> None:
+def test_a_drive_ends_at_damaged_bytes(recorded: Any, tmp_path: Path) -> None:
     data, path = recorded[0].read_bytes(), tmp_path / "drive.mcap"
     path.write_bytes(data[: len(data) // 2] + bytes(5000))
     with pytest.warns(DataWarning, match="cut off"):
@@ -331,7 +331,7 @@ def test_where_the_disk_holds_nonsense_the_drive_ends(recorded: Any, tmp_path: P
     assert 0 < len(ticks) < len(ticks_of(recorded[0]))
 
 
-def test_another_recording_that_is_cut_off_names_what_mends_it(recorded: Any, tmp_path: Path) -> None:
+def test_a_recording_that_is_cut_off_names_the_tool_that_mends_it(recorded: Any, tmp_path: Path) -> None:
     path = tmp_path / "cut.mcap"
     path.write_bytes(recorded[0].read_bytes()[:-1])
     with pytest.raises(DataError) as caught:

@@ -498,37 +498,6 @@ def test_chunks_that_unpack_to_much_together(tmp_path: Path, monkeypatch: pytest
         read(path)
 
 
-def test_listing_the_topics_is_within_limits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["import", str(bomb(tmp_path / "drive", "sqlite3 FILE"))]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == "" and captured.err.count("\n") == 1
-    assert "would unpack to more than 50 times its size" in captured.err
-
-
-def test_other_programs_use_rosbags_without_limits(tmp_path: Path) -> None:
-    from rosbags.highlevel import AnyReader
-
-    assert read(bomb(tmp_path / "small", "mcap", 100)) == 1
-    path = bomb(tmp_path / "drive", "mcap STORAGE")
-    with AnyReader([path]) as reader:
-        assert [len(data) for _, _, data in reader.messages()] == [LARGE]
-
-
-@pytest.mark.parametrize("form", ["mcap STORAGE", "mcap MESSAGE", "mcap FILE", "sqlite3 FILE", "ros1 LZ4"])
-def test_rosbags_unpacks_nothing(form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Any version of it is as good: limits are those of coopenv."""
-    from rosbags.rosbag1.reader import decompressors
-    from rosbags.rosbag2 import reader
-    from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
-
-    path = bomb(tmp_path / "drive", form, 2**20, 3)
-    monkeypatch.delattr(reader, "zstd")
-    for table in (decompressors, DECOMPRESSORS):
-        for name in list(table):
-            monkeypatch.delitem(table, name)
-    assert read(path) == 3
-
-
 def warned(folder: Path, text: str, drive: list[bags.Message]) -> list[str]:
     """Return the warnings at the opening of a bag."""
     with warnings.catch_warnings(record=True) as caught:

@@ -77,16 +77,6 @@ def test_the_demo_drives_and_can_be_run_again(environment: str, tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_in_real_time_the_demo_has_a_router_and_a_process_per_car(tmp_path: Path) -> None:
-    """A busy computer may stop the cars."""
-    process = real_time_demo(tmp_path, port := free_port(), "--set", "horizon=3")
-    printed, errors = process.communicate(timeout=4 * DEADLOCK)
-    assert process.returncode == (STOPPED if "Stopped: " in printed else 0), errors
-    assert "in real time, seed 0" in printed and "wake-up lateness p99" in printed
-    assert not mentioning(f"127.0.0.1:{port}")
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("moment", ["starting", "driving"])
 def test_an_interrupt_leaves_no_process_and_what_has_been_driven(moment: str, tmp_path: Path) -> None:
     port = free_port()

@@ -78,12 +78,6 @@ def test_a_gate_obeys_the_given_senders(fleet: Path) -> None:
         open_fake(fleet, "svea7", Hub().connect(), station="svea9")
 
 
-def test_keys_of_the_gate_are_needed_where_the_deployment_has_some(fleet: Path) -> None:
-    fleet.write_text(fleet.read_text() + '[security]\nkeys = "keys"\n')
-    with pytest.raises(CoopenvError, match="keys"):
-        open_fake(fleet, "svea7", Hub().connect())
-
-
 FLEETS = sorted((ROOT / "examples" / "fleet").glob("*.toml"))
 SHIPPED = ROOT / "examples" / "fleet" / "overtaking.toml"
 
@@ -203,13 +197,6 @@ def test_who_is_slow_is_not_waited_for() -> None:
     with pytest.raises(FakesError, match="router is not ready in time: it has printed nothing"):
         fake_processes(SHIPPED, port, patience=0.05).__enter__()
     assert not mentioning(f"tcp/127.0.0.1:{port}")
-
-
-def test_real_cars_have_no_fakes(tmp_path: Path) -> None:
-    file = tmp_path / "cars.toml"
-    file.write_text(SHIPPED.read_text().replace("fakes = true", "fakes = false"))
-    with pytest.raises(CoopenvError, match=r"cars\.toml: fakes = true is missing"):
-        fake_processes(file).__enter__()
 
 
 # Listening to a gate: what is no message of a gate fills no memory and hides none

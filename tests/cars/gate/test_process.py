@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import socket
@@ -13,20 +12,22 @@ import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
-from random import Random
 
 import pytest
 
+from coopenv.cars.fake.lockstep import Hub
+from coopenv.cars.gate.process import gate_deployment, prepare_gate
 from coopenv.cars.gate.wheel_command import NEUTRAL
-from coopenv.cars.link.keys import load_signer, load_verifier, make_keys
+from coopenv.cars.link.clock import CLOCK
+from coopenv.cars.link.keys import load_signer, make_keys
 from coopenv.cars.link.zenoh import LEASE, open_zenoh
 from coopenv.cars.settings.profile import Role
 from coopenv.cli.app import main
 from tests.cars.gate import messages
-from tests.cars.gate.bench import CAR, messages_of_strangers
+from tests.cars.gate.bench import CAR
 from tests.cars.gate.station import Station, running_gate
-from tests.helpers.processes import COOPENV, ROOT, started, wait_until
-from tests.helpers.wire import free_endpoint, heard_by, running
+from tests.helpers.processes import ROOT, wait_until
+from tests.helpers.wire import free_endpoint, running
 
 pytest.importorskip("zenoh", reason="needs the extra 'svea'")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals and modes of files")
@@ -81,24 +82,6 @@ def test_a_station_arms_drives_and_stops(station: Station) -> None:
     assert station.status.state == "armed"
 
 
-def test_bad_messages_leave_it_working(station: Station, keys: Path) -> None:
-    station.arm("a")
-    station.drive()
-    wait_until(lambda: station.status.state == "timed_out")
-    accepted, begun = station.status.accepted, time.time()
-    signers = load_signer(keys, "station"), load_signer(keys, "other")
-    bad = messages_of_strangers(Random(3), *signers, "a", station.sequence, time.time_ns)
-    for i in range(3000):
-        station.send_raw(*next(bad))
-        if i % 50 == 0:
-            time.sleep(0.01)
-    wait_until(lambda: sum(station.status.counts) >= 3000)
-    assert station.status.accepted == accepted
-    assert set(station.since(begun)) == {NEUTRAL}
-    station.sequence += 10
-    station.drive()
-
-
 def test_systemd_hears_it_until_it_is_frozen(endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
@@ -111,19 +94,18 @@ def test_systemd_hears_it_until_it_is_frozen(endpoint: str, tmp_path: Path, monk
             with pytest.raises(TimeoutError):
                 for _ in range(50):  # those under way
                     systemd.recv(64)
+            process.kill()
+            assert process.communicate()[1].startswith("warning: without --keys whoever")
 
 
-@pytest.mark.parametrize("duration", [0.2, 2.0])
-def test_what_comes_while_it_is_frozen_moves_nothing(
-    station: Station, gate: subprocess.Popen[str], duration: float
-) -> None:
+def test_what_comes_while_it_is_frozen_moves_nothing(station: Station, gate: subprocess.Popen[str]) -> None:
     station.arm("a")
     station.drive()
     frozen = time.time()
     gate.send_signal(signal.SIGSTOP)
     time.sleep(0.05)
     sent = station.sequence
-    while time.time() < frozen + duration:
+    while time.time() < frozen + 0.2:
         station.command(0.5)
         time.sleep(0.05)
     time.sleep(0.2)  # the youngest is older than it may be, too
@@ -139,7 +121,10 @@ def test_what_comes_while_it_is_frozen_moves_nothing(
     station.drive()
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 143)])
+@pytest.mark.parametrize(
+    ("number", "status"),
+    [(signal.SIGINT, 130), (signal.SIGHUP, 143)],  # SIGHUP is answered by SIGTERM
+)
 def test_a_signal_leaves_the_car_in_neutral(
     station: Station, gate: subprocess.Popen[str], number: signal.Signals, status: int
 ) -> None:
@@ -174,38 +159,28 @@ def test_a_router_that_comes_back_finds_the_gate(keys: Path, tmp_path: Path) -> 
         assert gate.wait(timeout=10) == 143
 
 
-def test_the_status_is_signed_by_the_car(endpoint: str, keys: Path, gate: subprocess.Popen[str]) -> None:
-    with closing(open_zenoh("client", [endpoint])) as transport:
-        heard = heard_by(transport, "fleet/*/coopenv/gate")
-        wait_until(lambda: heard)
-    assert load_verifier(keys).signer(heard[0].topic, heard[0].payload, heard[0].attachment) == CAR
-
-
-def test_a_deployment_file_contains_all_settings(endpoint: str, keys: Path, tmp_path: Path) -> None:
+def test_a_deployment_file_contains_all_settings(keys: Path, tmp_path: Path) -> None:
     lines = [
         'environment = "none of its business"',
         f'cars = [{{name = "{CAR}"}}]',
         # Of the station: the gate does not go there, and on its own computer it needs no certificate.
         'network = {connect = ["tls/192.0.2.1:7447"], tls = {root_ca = "not_on_the_car.pem"}}',
-        f'gate.connect = ["{endpoint}"]',
+        'gate.connect = ["tcp/127.0.0.1:1"]',
+        f'security = {{keys = "{keys}", identity = "other"}}',
+        "safety.max_speed = 0.2",
     ]
-    lines += [f'security = {{keys = "{keys}", identity = "other"}}', "safety.max_speed = 0.2"]
     (tmp_path / "fleet.toml").write_text("\n".join(lines))
-    command = (*COOPENV, "svea", "gate", "fleet.toml", "--car", CAR)
-    with started(command, tmp_path), closing(open_zenoh("client", [endpoint])) as transport:
-        station = Station(transport, load_signer(keys, "other"))
-        station.arm("a")
-        station.command(speed=0.3)
-        wait_until(lambda: station.count("limits") == 1)
-
-
-def test_without_keys_it_warns(endpoint: str, tmp_path: Path) -> None:
-    with running_gate(endpoint, tmp_path) as gate, closing(open_zenoh("client", [endpoint])) as transport:
-        station = Station(transport, None)
-        station.arm("a")
-        station.drive()
-        gate.terminate()
-        assert gate.communicate(timeout=10)[1].startswith("warning: without --keys whoever")
+    fleet = gate_deployment(CAR, tmp_path / "fleet.toml")
+    assert (fleet.network.connect, fleet.network.tls) == (("tcp/127.0.0.1:1",), None)
+    hub = Hub()
+    station = Station(hub.connect(), load_signer(keys, "other"))
+    link = prepare_gate(fleet, CAR)(hub.connect(), CLOCK)
+    link.publish_status()
+    station.send(Role.ARM, messages.arm(time.time_ns(), "a", station.status.nonce))
+    station.session = "a"
+    station.command(speed=0.3)
+    link.publish_status()
+    assert (station.status.state, station.count("limits")) == ("armed", 1)
 
 
 @pytest.mark.parametrize(
@@ -257,20 +232,6 @@ def test_the_health_check_of_the_image_reads_alone(
     gate.kill()
     gate.wait()
     assert main([*words, "--patience", "0.2"]) != 0
-
-
-def test_it_loads_neither_the_simulation_nor_numpy() -> None:
-    code = (
-        "import sys; sys.argv[0] = 'coopenv'\n"  # the package does not register environments for its own command
-        "import coopenv.cars.gate.gate, coopenv.cars.gate.process, coopenv.cars.link.keys\n"
-        "import coopenv.cars.settings.deployment, coopenv.cars.link.zenoh\n"
-        "print(*sys.modules)"
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ}
-    )
-    loaded = {name.partition(".")[0] for name in result.stdout.split()}
-    assert not {"numpy", "warp", "scipy", "matplotlib", "rosbags", "gymnasium"} & loaded
 
 
 @pytest.mark.parametrize("command", ["gate", "health"])
