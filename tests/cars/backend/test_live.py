@@ -86,7 +86,7 @@ def test_armed_cars_drive_and_know_where_they_are(lab: Any, env: Env) -> None:
         assert infos[agent]["position_error"] < 0.15 and infos[agent]["orientation_error"] < 5.0
 
 
-def test_nobody_drives_without_being_armed(lab: Any) -> None:
+def test_cars_that_are_not_armed_stand(lab: Any) -> None:
     path, hub, made = lab
     commands = listen(hub, SVEA.topic_of("*", Role.COMMAND))
     with closing(env_of(cars(path, hub))) as env:
@@ -122,7 +122,7 @@ def test_a_car_that_freezes_stops_all_and_arming_anew_recovers(lab: Any, tmp_pat
         assert np.linalg.norm(place(made, "svea7") - before) > 0.05
 
 
-def test_what_is_recorded_is_replayed_bit_for_bit_and_under_other_observers(lab: Any, tmp_path: Path) -> None:
+def test_a_drive_is_replayed_bit_for_bit_and_under_other_observers(lab: Any, tmp_path: Path) -> None:
     path, hub, _ = lab
     record = tmp_path / "drive.mcap"
     with closing(env_of(cars(path, hub, record=record))) as env:
@@ -204,7 +204,7 @@ def test_nothing_is_armed_that_should_not_be(lab: Any, tmp_path: Path) -> None:
         send_fault(hub, "svea1", "clock_offset=0")
 
 
-def test_nothing_is_armed_where_nobody_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_absent_cars_are_not_armed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for patience in ("FIRST_MESSAGES_TIME", "CAMERA_INFO_TIME", "READY_TIME"):
         monkeypatch.setattr(f"coopenv.cars.backend.backend.{patience}", 0.1)
     refuses(write_fleet(tmp_path), Hub(), r"not armed: svea7: no odometry on fleet/svea7/mavros/wheel_odometry")
@@ -288,7 +288,7 @@ def test_cars_are_not_armed_where_they_must_not_be_or_with_another_camera(
     refuses(write_fleet(tmp_path, first + OVERTAKING, SAFETY + safety), lab[1], why, car)
 
 
-def test_a_car_that_somebody_has_stopped_is_released_on_purpose(lab: Any, tmp_path: Path) -> None:
+def test_a_car_stopped_by_another_station_needs_a_release(lab: Any, tmp_path: Path) -> None:
     _, hub, _ = lab
     with closing(env_of(cars(write_fleet(tmp_path, OVERTAKING.replace("fakes = true", "")), hub))) as env:
         env.reset(options={"arm": True, "release": True})
@@ -314,7 +314,7 @@ STICKS = {"rssi": 100, "channels": np.array([1500, 1500, 1800, 1500, 1500], dtyp
         ("svea7", Role.STOP, {"data": True}, "svea7: its gate is stopped"),
     ],
 )
-def test_who_takes_the_remote_control_or_stops_a_car_ends_the_episode(
+def test_the_remote_control_and_a_stop_end_the_episode(
     lab: Any, env: Env, car: str, role: Role, fields: dict[str, Any], why: str
 ) -> None:
     env.reset(seed=0, options={"arm": True})
@@ -350,7 +350,7 @@ def test_an_error_between_steps_stops_the_cars(lab: Any) -> None:
 
 
 @pytest.mark.parametrize("options", [{"arms": True}, {"arm": 1}])
-def test_options_that_are_none(env: Env, options: dict[str, Any]) -> None:
+def test_unknown_options_of_a_reset_are_refused(env: Env, options: dict[str, Any]) -> None:
     with pytest.raises(CoopenvError, match="option"):
         env.reset(seed=0, options=options)
 

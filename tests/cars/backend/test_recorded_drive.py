@@ -275,7 +275,7 @@ def test_the_messages_that_explain_a_stop_are_recorded(recorded: Any) -> None:
     assert (reason, car) == (REASON, "svea7")
 
 
-def test_a_replay_reports_what_the_live_run_reported(recorded: Any, tmp_path: Path) -> None:
+def test_a_replay_has_the_report_of_the_live_run(recorded: Any, tmp_path: Path) -> None:
     path, printed, live = recorded
     assert f"Stopped: {REASON}" in printed
     backend = Drive(path)

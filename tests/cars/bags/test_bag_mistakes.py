@@ -107,7 +107,7 @@ def test_a_bag_without_truth_is_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["ros1", "sqlite3", "mcap"])
-def test_an_empty_bag_says_so(form: str, tmp_path: Path) -> None:
+def test_an_empty_bag_is_refused(form: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"has no topic .*; it has none at all"):
         opened(tmp_path, MAP, [], form)
 
@@ -178,9 +178,7 @@ def test_a_recording_with_its_scene_is_no_bag(tmp_path: Path, capsys: pytest.Cap
 
 
 @pytest.mark.parametrize("form", ["ros1", "mcap"])
-def test_bytes_that_changed_are_one_line_or_what_could_be_read(
-    form: str, written: dict[str, Path], topics: Path
-) -> None:
+def test_changed_bytes_give_one_error_line_or_a_bag(form: str, written: dict[str, Path], topics: Path) -> None:
     data, generator = written[form].read_bytes(), np.random.default_rng(5)
     for number in range(6):
         changed = bytearray(data)
@@ -291,7 +289,7 @@ def test_the_camera_publishes_its_own_calibration(tmp_path: Path) -> None:
         assert_allclose(ray[1] / ray[2], (block["center_y"] - 100.0) / 410.0)
 
 
-def test_corrections_count_more_than_what_the_car_publishes(tmp_path: Path) -> None:
+def test_corrections_replace_the_published_calibration(tmp_path: Path) -> None:
     fields = {"k": [400.0, 0, 160, 0, 410.0, 100, 0, 0, 1], "d": np.zeros(5)}
     fields |= {"height": 208, "width": 316, "distortion_model": "plumb_bob"}
     info = bags.Message("/agent8/pixy_node/camera_info", "sensor_msgs/msg/CameraInfo", 0, 0, fields)
@@ -310,7 +308,7 @@ def test_corrections_count_more_than_what_the_car_publishes(tmp_path: Path) -> N
     assert twists
 
 
-def test_a_lead_of_a_topic_holds_whatever_the_clock_of_its_car(tmp_path: Path) -> None:
+def test_a_lead_of_a_topic_holds_for_any_clock_of_its_car(tmp_path: Path) -> None:
     lead, twist = 0.015, "/agent8/actuation_twist"
     for ahead in (0.0, 0.4):
         drive = bags.later(bags.later(short(), stamps=ahead, topics="/agent8"), stamps=-lead, topics=twist)
@@ -334,7 +332,7 @@ def test_motion_capture_far_from_the_map_is_warned_of(tmp_path: Path) -> None:
         opened(tmp_path, MAP, drive)
 
 
-def test_a_camera_that_says_it_is_not_calibrated_has_the_calibration_of_the_environment(tmp_path: Path) -> None:
+def test_an_uncalibrated_camera_has_the_calibration_of_the_environment(tmp_path: Path) -> None:
     fields = {"k": np.zeros(9), "d": [], "height": 208, "width": 316, "distortion_model": ""}
     info = bags.Message("/agent8/pixy_node/camera_info", "sensor_msgs/msg/CameraInfo", 0, 0, fields)
     with pytest.warns(DataWarning, match=r"camera_info: says that the camera is not calibrated \(k is zero\)"):

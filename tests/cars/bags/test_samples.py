@@ -79,7 +79,7 @@ def test_a_sample_gives_the_accuracy_of_a_clean_drive(tmp_path: Path, capsys: py
     assert len(rmse) == 2 and all(value < 0.03 for value in rmse.values())
 
 
-def test_the_proposed_map_reads_what_the_written_one_reads(tmp_path: Path) -> None:
+def test_the_proposed_map_gives_the_samples_of_the_written_map(tmp_path: Path) -> None:
     path = tmp_path / "topics.toml"
     assert main(["import", str(SAMPLES / "mcap"), "--propose", str(path)]) == 0
     assert load_map(path).environment == "my_environment.toml"

@@ -58,7 +58,7 @@ def test_a_turn_rate_that_changes_contradicts_nothing(speed: float) -> None:
     assert constant_turn_rate(tracks, seen, WHEELBASE) is not None
 
 
-def test_a_turn_rate_that_is_stuck_is_named_and_a_circle_is_none() -> None:
+def test_a_stuck_turn_rate_is_named_and_a_circle_contradicts_nothing() -> None:
     circle = np.full(len(TIMES), 0.3)
     tracks, seen = drive(0.4, circle, AROUND)
     assert constant_turn_rate(tracks | {"gyro": circle}, seen, WHEELBASE) is None
@@ -71,7 +71,9 @@ def test_a_turn_rate_that_is_stuck_is_named_and_a_circle_is_none() -> None:
     st.floats(-10.0, 10.0),
 )
 @settings(max_examples=50, deadline=None)
-def test_a_straight_drive_past_landmarks_is_none(landmarks: list[tuple[float, float]], speed: float) -> None:
+def test_a_straight_drive_past_landmarks_contradicts_nothing(
+    landmarks: list[tuple[float, float]], speed: float
+) -> None:
     """Translation moves bearings away from the axis of motion, however near a landmark is."""
     far = np.array([(x, y) for x, y in landmarks if abs(y) > 1e-3] or [(5.0, 5.0)])
     tracks, seen = drive(speed, np.zeros(len(TIMES)), far)

@@ -192,7 +192,7 @@ def test_other_models_of_a_lens_are_calibrated(bent: tuple[float, ...]) -> None:
 TOPICS = (("/camera", -0.12), ("/wheels", -0.12), ("/truth", 0.3))
 
 
-def test_the_file_has_what_holds_for_other_drives() -> None:
+def test_the_file_has_constants_that_hold_for_other_drives() -> None:
     """Delays of topics against the turn rates of their car, and errors of odometry; no offset of a clock."""
     given = drive()
     car = replace(given.cars[0], topics=TOPICS, gyro_added=-0.06)
@@ -217,7 +217,7 @@ def test_turn_rates_in_degrees_are_named_and_give_no_overrides() -> None:
     assert written["overrides"] == {} == written["clocks"]["leads"] and "corrections" not in written
 
 
-def test_the_file_sets_what_was_wrong() -> None:
+def test_the_file_sets_wrong_constants() -> None:
     written = tomllib.loads(toml_text(calibrate(drive(lever=LEVER - [0, 0, 0.02]))))
     scenario = load_scenario("svea_crossing", {k: v for k, v in written["overrides"].items() if "landmarks" not in k})
     assert abs(scenario.cameras[0].position[2] - 0.2233) < 1e-3

@@ -138,7 +138,7 @@ def test_a_fake_becomes_the_car(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert made.fake.latency == pytest.approx(0.09, abs=0.003) and "dynamics.dead_band" in made.overrides
 
 
-def test_what_is_missing_is_one_line(tmp_path: Path) -> None:
+def test_missing_topics_and_cars_are_one_line(tmp_path: Path) -> None:
     folder = driven(tmp_path, 2.0)
     (folder / "names.toml").write_text(MAP + 'topics = { manual = "/nowhere" }\n', encoding="utf-8")
     bag = str(folder / "bag")

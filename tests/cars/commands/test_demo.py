@@ -78,7 +78,7 @@ def test_the_demo_drives_and_can_be_run_again(environment: str, tmp_path: Path) 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("moment", ["starting", "driving"])
-def test_an_interrupt_leaves_no_process_and_what_has_been_driven(moment: str, tmp_path: Path) -> None:
+def test_an_interrupt_ends_all_processes_and_keeps_the_drive(moment: str, tmp_path: Path) -> None:
     port = free_port()
     process = real_time_demo(tmp_path, port)
     try:
@@ -202,7 +202,7 @@ def replayed(folder: Path) -> tuple[str, str]:
 
 
 @pytest.mark.slow
-def test_what_an_interrupt_keeps_is_reported_and_can_be_shown(fleet: tuple[Path, str], tmp_path: Path) -> None:
+def test_the_drive_of_an_interrupted_run_is_reported_and_replayed(fleet: tuple[Path, str], tmp_path: Path) -> None:
     errors, status = interrupted(fleet, tmp_path, signal.SIGINT)
     assert status == 130
     assert errors.splitlines()[-1] == "interrupted; kept: drive.mcap, the drive up to here: coopenv run drive.mcap"
@@ -323,7 +323,7 @@ def test_the_record_of_some_vehicles_keeps_the_others_as_targets(run: dict[str, 
     assert whole.of_vehicles([0, 1]) is whole
 
 
-def test_what_gates_refused_before_does_not_count() -> None:
+def test_refusals_before_the_arming_do_not_count() -> None:
     hub = Hub()
     link, gate = hub.connect(), hub.connect()
     gates = Gates(link, ("svea7",), USUAL, None)
@@ -349,7 +349,7 @@ def test_what_gates_refused_before_does_not_count() -> None:
     assert gates.refused("svea7") == {"stale": 2, "session": 3}  # it was started anew
 
 
-def test_what_no_camera_can_measure_is_reported(tmp_path: Path) -> None:
+def test_cars_and_landmarks_without_markers_are_reported(tmp_path: Path) -> None:
     path = write_fleet(tmp_path, OVERTAKING.replace("SL2 = 2, ", "").replace("marker = 6", ""))
     with pytest.warns(DataWarning, match=r"fleet\.toml: no markers, .*: SL2, vehicle_2$"):
         cars(path, Hub()).close()

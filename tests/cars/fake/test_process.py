@@ -49,7 +49,7 @@ def fleet(tmp_path: Path) -> Path:
     return write_fleet(tmp_path, f'{OVERTAKING}[network]\nconnect = ["{free_endpoint()}"]\n', safety="")
 
 
-def test_what_does_not_fit_is_one_line(fleet: Path) -> None:
+def test_unknown_cars_and_faults_are_one_line(fleet: Path) -> None:
     with pytest.raises(CoopenvError, match="unknown car 'svea9'"):
         open_fake(fleet, "svea9", Hub().connect())
     result = CliRunner().invoke(app, ["svea", "fake", str(fleet), "--car", "svea7", "--fault", "melt"])
@@ -184,7 +184,7 @@ def test_health_takes_no_status_that_the_car_has_not_signed(tmp_path: Path) -> N
     assert "gate disarmed" in unsigned and "\x1b" not in unsigned
 
 
-def test_who_cannot_start_says_why() -> None:
+def test_a_router_that_cannot_start_is_reported_with_the_reason() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(FakesError, match=rf"router has ended with status 2: tcp/127.0.0.1:{port}: no Zenoh there"):
@@ -192,7 +192,7 @@ def test_who_cannot_start_says_why() -> None:
     assert not mentioning(f"tcp/127.0.0.1:{port}")
 
 
-def test_who_is_slow_is_not_waited_for() -> None:
+def test_a_slow_router_is_ended_and_reported() -> None:
     port = free_port()
     with pytest.raises(FakesError, match="router is not ready in time: it has printed nothing"):
         fake_processes(SHIPPED, port, patience=0.05).__enter__()
@@ -224,7 +224,7 @@ def first_status(payloads: Iterator[bytes]) -> Any:
     return next_message(Crowded(payloads), TOPIC, SVEA.topics[Role.GATE].type, 0.2)  # type: ignore[arg-type]
 
 
-def test_the_first_word_of_a_gate_is_found_among_others() -> None:
+def test_the_first_status_of_a_gate_is_found_among_other_bytes() -> None:
     good = status_message()
     assert first_status(iter([b"", b"nonsense", good + bytes(MOST_BYTES), good, b"nonsense"])).state == ""
 

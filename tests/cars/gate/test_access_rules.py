@@ -158,7 +158,9 @@ def test_a_gate_behind_an_open_network_is_not_armed_and_stops_at_once() -> None:
     assert unprobed.states[CAR].state == "stopped"
 
 
-def test_an_attack_finds_what_is_open(doors: Doors, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_attack_gets_through_an_open_router_alone(
+    doors: Doors, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     few = ("the same under wildcards", "arming, commands without signature", "services: arming, mode")
     monkeypatch.setattr("coopenv.cars.gate.attack.SETTLE", 0.25)
     every = Intruder.kinds

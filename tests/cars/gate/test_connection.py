@@ -47,7 +47,7 @@ def pair(kind: Callable[..., Gate] = Gate) -> tuple[GateConnection, Station]:
     return GateConnection(kind(CAR, LIMITS, CLOCK), hub.connect()), station
 
 
-def test_a_tick_sends_what_it_returns() -> None:
+def test_a_tick_sends_the_command_that_it_returns() -> None:
     link, station = pair()
     assert station.present
     payloads = [link.tick() for _ in range(9)]

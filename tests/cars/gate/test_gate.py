@@ -86,7 +86,7 @@ def test_without_commands_the_car_gets_neutral_and_newer_commands_go_on_from_a_s
     assert output.speed == pytest.approx(0.05, abs=1e-6) and bench.gate.state is GateMode.ARMED
 
 
-def test_what_a_stalled_link_delivers_late_moves_nothing() -> None:
+def test_late_commands_of_a_stalled_link_move_nothing() -> None:
     bench = armed(10)
     sent = []
     for sequence in range(100, 160):
@@ -184,7 +184,7 @@ def test_commands_are_finite_and_inside_the_limits(steering: float, speed: float
     assert reason is None or output == NEUTRAL
 
 
-def test_a_station_that_commands_what_is_no_number_stops_its_car_at_once() -> None:
+def test_a_command_that_is_not_finite_stops_the_car() -> None:
     bench = armed(10)
     assert bench.command(speed=math.nan) is Reason.NOT_FINITE
     assert bench.tick() == NEUTRAL and bench.gate.state is GateMode.TIMED_OUT
@@ -213,7 +213,7 @@ def test_only_the_station_arms_and_commands() -> None:
     assert bench.command() is None
 
 
-def test_a_signature_for_another_car_or_topic_is_none() -> None:
+def test_a_signature_for_another_car_or_topic_is_refused() -> None:
     bench = armed()
     payload = messages.command(bench.wall, "s1", 1)
     for topic in ("fleet/svea8/coopenv/cmd", "fleet/svea7/coopenv/arm", "svea7/coopenv/cmd"):
@@ -290,7 +290,7 @@ def test_a_stop_holds_until_the_next_arming() -> None:
     assert bench.drive(1).speed == pytest.approx(0.05, abs=1e-6)
 
 
-def test_what_is_no_stop_stops_nothing() -> None:
+def test_malformed_stops_stop_nothing() -> None:
     bench = armed(10)
     for payload in (b"", b"\0\1\0\0", messages.stop() + bytes(4), bytes(600)):
         assert bench.gate.arrive(Role.STOP, payload) in (Reason.MALFORMED, Reason.TOO_LONG)

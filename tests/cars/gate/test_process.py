@@ -82,7 +82,9 @@ def test_a_station_arms_drives_and_stops(station: Station) -> None:
     assert station.status.state == "armed"
 
 
-def test_systemd_hears_it_until_it_is_frozen(endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_systemd_is_notified_until_the_gate_freezes(
+    endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
         systemd.settimeout(10.0)
@@ -98,7 +100,7 @@ def test_systemd_hears_it_until_it_is_frozen(endpoint: str, tmp_path: Path, monk
             assert process.communicate()[1].startswith("warning: without --keys whoever")
 
 
-def test_what_comes_while_it_is_frozen_moves_nothing(station: Station, gate: subprocess.Popen[str]) -> None:
+def test_commands_to_a_frozen_gate_move_nothing(station: Station, gate: subprocess.Popen[str]) -> None:
     station.arm("a")
     station.drive()
     frozen = time.time()

@@ -80,7 +80,7 @@ def settle(sender: Transport, receiver: Transport) -> None:
     wait_until(lambda: heard, lambda: sender.publish("fleet/settle", b""))
 
 
-def test_messages_arrive_in_order_with_what_is_beside_them(connect: Connect) -> None:
+def test_messages_arrive_in_order_with_their_attachments(connect: Connect) -> None:
     sender, receiver = connect(), connect()
     heard = heard_by(receiver, "fleet/svea7/x")
     settle(sender, receiver)
@@ -110,7 +110,7 @@ def test_patterns_choose(connect: Connect) -> None:
     assert all(arrival.payload == arrival.topic.encode() for arrival in (*one, *all_, *exact))
 
 
-def test_who_is_there_is_seen_by_those_who_came_before_and_after(connect: Connect) -> None:
+def test_presence_is_seen_by_earlier_and_later_connections(connect: Connect) -> None:
     early, car, late = connect(), connect(), connect()
     everything, seen = heard_by(early, "**"), seen_by(early)
     car.announce("fleet/alive/svea7")
@@ -192,7 +192,7 @@ def test_a_riccati_point_is_a_position_without_orientation_or_covariance() -> No
     assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == STAMP
 
 
-def test_what_the_gate_lets_through_is_what_the_low_level_takes() -> None:
+def test_a_command_of_the_gate_is_the_low_level_request() -> None:
     """0.2 rad to the left and 0.8 m/s, as KTH's interface says it."""
     authors, _, heard = ends()
     message = make(SVEA.topics[Role.MANUAL].type, y=-286.48, z=500.0 - 5 * 100 * 0.8 / 1.7, aux3=1000.0)

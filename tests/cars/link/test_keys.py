@@ -67,7 +67,7 @@ def test_a_private_file_of_another_is_refused_by_the_names_of_both_files(folder:
         load_signer(folder, "station")
 
 
-def test_nobody_else_can_read_private_files(folder: Path) -> None:
+def test_private_files_are_readable_by_their_owner_alone(folder: Path) -> None:
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     for name in NAMES:
         assert stat.S_IMODE((folder / f"{name}.pem").stat().st_mode) == 0o600
@@ -121,7 +121,7 @@ def test_a_file_of_another_user_is_refused(folder: Path, monkeypatch: pytest.Mon
         load_signer(folder, "svea7")
 
 
-def test_what_is_no_plain_file_is_refused(folder: Path) -> None:
+def test_pipes_and_folders_are_refused_as_keys(folder: Path) -> None:
     for name, make in (("pipe", os.mkfifo), ("folder", os.mkdir)):
         make(folder / f"{name}.pem", 0o600)
         with pytest.raises(KeyFileError, match="no plain file"):
@@ -131,7 +131,7 @@ def test_what_is_no_plain_file_is_refused(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "-----BEGIN PRIVATE KEY-----\nsecret\n-----END PRIVATE KEY-----\n", "\0\xff"])
-def test_what_is_no_key_is_refused_without_quoting_it(folder: Path, text: str) -> None:
+def test_a_malformed_key_is_refused_and_not_quoted(folder: Path, text: str) -> None:
     (folder / "svea7.pem").write_text(text)
     with pytest.raises(KeyFileError, match="no private key") as raised:
         load_signer(folder, "svea7")
@@ -140,14 +140,14 @@ def test_what_is_no_key_is_refused_without_quoting_it(folder: Path, text: str) -
 
 
 @pytest.mark.parametrize("text", ["", "keys = 3", "[keys]\nsvea7 = 3", "[keys]\n'a/b' = 'x'", "[keys", "[keys]\na='!'"])
-def test_what_is_no_public_file_is_refused(folder: Path, text: str) -> None:
+def test_a_malformed_public_file_is_refused(folder: Path, text: str) -> None:
     (folder / PUBLIC).write_text(text)
     with pytest.raises(KeyFileError, match=r"public\.toml: (expected|keys\.a: expected)"):
         load_verifier(folder)
 
 
 @pytest.mark.parametrize("command", [["gate", "--car", "svea7"], ["fake", "--car", "svea7"], ["run"]])
-def test_who_has_anothers_key_does_not_even_look_for_the_network(
+def test_commands_with_the_key_of_another_do_not_connect(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(zenoh, "open_zenoh", lambda *_, **__: pytest.fail("the network is touched"))
@@ -179,7 +179,7 @@ def test_the_command_makes_keys_of_a_deployment(tmp_path: Path, capsys: pytest.C
     assert capsys.readouterr().out.count("is kept") == 3
 
 
-def test_the_command_takes_names_and_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_takes_names_and_refuses_malformed_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = ["--out", str(tmp_path / "k")]
     assert main(["svea", "keys", "--names", "svea7, station", *out]) == 0
     assert set(load_verifier(tmp_path / "k").identities) == {"svea7", "station"}
@@ -210,7 +210,7 @@ def test_a_signature_is_for_one_topic_and_one_payload(topic: str, payload: bytes
         assert VERIFIER.signer(topic, other.encode() + payload, attachment) is None
 
 
-def test_what_is_signed_is_what_the_documentation_says() -> None:
+def test_signed_bytes_are_the_documented_ones() -> None:
     attachment = STATION.sign("a/b", b"xyz")
     assert attachment[:8] == b"\x07station" and len(attachment) == 8 + 64
     text = DOMAIN + struct.pack("<BIQ", 7, 3, 3) + b"station" + b"a/b" + b"xyz"
@@ -218,12 +218,12 @@ def test_what_is_signed_is_what_the_documentation_says() -> None:
 
 
 @given(st.binary(max_size=120) | st.sampled_from([None, 3, "text", [300], object(), b""]))
-def test_what_is_no_attachment_names_nobody(attachment: Any) -> None:
+def test_malformed_attachments_have_no_signer(attachment: Any) -> None:
     assert VERIFIER.signer("a", b"b", attachment) is None
     assert VERIFIER.signer("\ud800", b"b", STATION.sign("a", b"b")) is None
 
 
-def test_each_changed_byte_and_each_length_names_nobody() -> None:
+def test_changed_and_cut_attachments_have_no_signer() -> None:
     attachment = STATION.sign("a", b"b")
     for i in range(len(attachment)):
         assert VERIFIER.signer("a", b"b", attachment[:i]) is None

@@ -29,7 +29,7 @@ from tests.helpers.wire import free_port, heard_by, listening, seen_by
 POINT = struct.pack("<IIII", 1, 2, 3, 3) + b"map" + struct.pack("<3d", 1.0, 2.0, 3.0)
 
 
-def test_no_broker_is_said_in_time() -> None:
+def test_a_missing_broker_is_reported_in_time() -> None:
     began = time.monotonic()
     endpoint = f"nats/127.0.0.1:{free_port()}"
     before = threading.active_count()
@@ -197,7 +197,7 @@ class End(HeartbeatTransport):
     def _end(self) -> None: ...
 
 
-def test_a_name_is_there_while_any_of_its_ends_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_is_present_while_any_of_its_ends_sends_heartbeats(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr(transport.time, "monotonic", lambda: now[0])
     watcher = End()

@@ -56,7 +56,7 @@ def point(x: float) -> bytes:
     return struct.pack("<IIII", 0, 3, 4, 3) + b"map" + struct.pack("<3d", x, 2.0, 7.0)
 
 
-def test_without_rospy_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_rospy_one_line_names_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rospy", None)
     with pytest.raises(CoopenvError, match=r"^ROS 1 needs rospy: install Debian's python3-rospy [^\n]+$"):
         open_ros1("tcp/127.0.0.1:11311", {})
@@ -70,13 +70,13 @@ def test_an_envelope_is_a_message_of_bytes(payload: bytes, attachment: bytes) ->
 
 
 @given(message=st.binary(max_size=64))
-def test_what_is_no_envelope_is_not_opened(message: bytes) -> None:
+def test_malformed_envelopes_are_not_opened(message: bytes) -> None:
     found = opened(message)
     assert found is None or sealed(*found) == message
 
 
 @pytest.mark.filterwarnings("error")
-def test_no_master_is_said_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_master_is_reported_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ros1, "rospy", lambda: None)  # it is not asked before there is a master
     began = time.monotonic()
     nobody = Address("tcp", "127.0.0.1", free_port())

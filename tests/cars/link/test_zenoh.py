@@ -94,21 +94,21 @@ def test_a_router_that_has_frozen_keeps_no_sender_waiting_for_long(
     router.kill()
 
 
-def test_a_router_that_is_not_there_is_said_in_time(endpoint: str) -> None:
+def test_a_missing_router_is_reported_in_time(endpoint: str) -> None:
     began = time.monotonic()
     with pytest.raises(LinkError, match=rf"^{endpoint}: no Zenoh there \(Connection refused\)$"):
         open_zenoh("client", connect=[endpoint], timeout=0.5)
     assert time.monotonic() - began < 10.0
 
 
-def test_who_does_not_answer_is_said() -> None:
+def test_a_silent_endpoint_is_reported() -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:  # as a firewall may: it takes the connection, and that is it
         endpoint = f"tcp/127.0.0.1:{silent.getsockname()[1]}"
         with pytest.raises(LinkError, match=rf"^{endpoint}: no Zenoh there \(no answer within 0\.5 s\)$"):
             open_zenoh("client", connect=[endpoint], timeout=0.5)
 
 
-def test_a_port_that_is_taken_is_said(endpoint: str) -> None:
+def test_a_taken_port_is_reported(endpoint: str) -> None:
     with (
         closing(open_zenoh("router", listen=[endpoint])),
         pytest.raises(LinkError, match=r"Address already in use"),
@@ -117,12 +117,12 @@ def test_a_port_that_is_taken_is_said(endpoint: str) -> None:
 
 
 @pytest.mark.parametrize("endpoint", ["127.0.0.1:7447", "tcp/127.0.0.1", "tls/127.0.0.1:7447"])
-def test_what_is_no_endpoint_or_lacks_certificates_is_refused(endpoint: str) -> None:
+def test_malformed_endpoints_and_missing_certificates_are_refused(endpoint: str) -> None:
     with pytest.raises(CoopenvError, match=r"is no endpoint|go together"):
         open_zenoh("client", connect=[endpoint])
 
 
-def test_nothing_is_listened_at_but_what_was_asked_for(endpoint: str, router: subprocess.Popen[str]) -> None:
+def test_processes_listen_at_the_given_endpoints_alone(endpoint: str, router: subprocess.Popen[str]) -> None:
     port = int(endpoint.rpartition(":")[2])
     with running("echo", endpoint) as echo:
         assert listening(router.pid) == [f"tcp 0100007F:{port:04X}"]
@@ -175,7 +175,7 @@ def test_a_router_with_another_address_in_its_certificate_is_refused(tmp_path: P
         open_transport(wanted, timeout=1.0)
 
 
-def test_who_shows_no_certificate_or_a_foreign_one_is_refused(tmp_path: Path, guarded: str) -> None:
+def test_clients_without_a_certificate_of_the_fleet_are_refused(tmp_path: Path, guarded: str) -> None:
     Authority(tmp_path, "other").certify("stranger")
     for shown in ({}, {"certificate": "stranger.pem", "key": "stranger.key"}):
         with pytest.raises(LinkError, match=rf"^{guarded}: no Zenoh there \([^\n]+\)$"):
@@ -210,7 +210,7 @@ def test_endpoints_have_three_parts() -> None:
     assert address_of("tcp/[::1]:7447").authority == "[::1]:7447"
 
 
-def test_what_is_on_this_computer_and_what_may_be_elsewhere() -> None:
+def test_loopback_addresses_are_recognised() -> None:
     here = ["127.0.0.1", "127.1.2.3", "[::1]", "localhost", "LocalHost"]
     hosts = [*here, "0.0.0.0", "10.0.0.1", "[::]", "[fe80::1]", "localhost.lab", "127.0.0.1.lab", "car"]
     assert [host for host in hosts if address_of(f"tcp/{host}:7447").loopback] == here
@@ -219,6 +219,6 @@ def test_what_is_on_this_computer_and_what_may_be_elsewhere() -> None:
 @pytest.mark.parametrize(
     "text", ["", "tcp", "tcp/", "tcp/a", "tcp/a:b", "tcp/a:65536", "http/a:1", "tcp/a b:1", "tcp/a:1\n"]
 )
-def test_what_is_none_is_refused(text: str) -> None:
+def test_malformed_endpoints_are_refused(text: str) -> None:
     with pytest.raises(CoopenvError, match="is no endpoint, expected for example"):
         address_of(text)

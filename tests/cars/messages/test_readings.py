@@ -163,7 +163,7 @@ UNKNOWN = {
 
 @pytest.mark.parametrize("name", UNKNOWN)
 @pytest.mark.parametrize("kind", ["nav_msgs/msg/Odometry", ESTIMATE])
-def test_a_pose_counts_whatever_its_covariance(kind: str, name: str) -> None:
+def test_a_pose_counts_with_any_covariance(kind: str, name: str) -> None:
     message = make(kind, pose=pose(covariance=UNKNOWN[name]))
     for role in (Role.TRUTH, Role.ESTIMATE):
         value = read(role, message)
@@ -184,7 +184,7 @@ def test_quaternions_a_few_per_cent_long_are_normalised(length: float) -> None:
     assert_allclose(value.rotation, turn.as_matrix(), atol=1e-12)
 
 
-def test_velocities_that_an_odometry_does_not_measure_are_none() -> None:
+def test_unmeasured_velocities_are_none() -> None:
     unmeasured = {"twist": ((2, 0, 0), (0, 0, 0)), "covariance": np.diag([1, 1, 1, 1, 1, -1.0])}
     value = read(Role.WHEEL, make("nav_msgs/msg/Odometry", pose=pose(), twist=unmeasured))
     assert isinstance(value, Twist) and value.angular is None and value.linear is not None
@@ -280,7 +280,7 @@ WRONG: list[tuple[Role, Any, str]] = [
 
 
 @pytest.mark.parametrize(("role", "made", "line"), WRONG)
-def test_what_makes_no_sense_is_one_line(role: Role, made: Any, line: str) -> None:
+def test_absurd_values_are_one_line(role: Role, made: Any, line: str) -> None:
     with pytest.raises(CoopenvError, match=line) as caught:
         read(role, made())
     assert "\n" not in str(caught.value)

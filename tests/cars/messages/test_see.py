@@ -253,7 +253,7 @@ def test_frames_are_refused_at_the_station(tmp_path: Path) -> None:
         load_deployment(path)
 
 
-def test_a_profile_has_what_its_base_has() -> None:
+def test_a_profile_inherits_from_its_base() -> None:
     made, svea = profile_with(IMAGE), load_profile("svea")
     assert made.topics[Role.DETECTIONS].name == "fleet/{car}/camera/frames" and made.markers == (0, 29)
     assert made.sees_frames and not svea.sees_frames

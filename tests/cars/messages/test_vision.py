@@ -151,7 +151,7 @@ def test_blobs_of_colour(encoding: str) -> None:
         assert np.degrees(np.linalg.norm(ray - unit(exact))) < 0.02
 
 
-def test_what_is_wrong_is_one_line() -> None:
+def test_unreadable_frames_are_one_line() -> None:
     with pytest.raises(ValueError, match=r"unknown family 'tag36h12'.*tag36h11"):
         VisionSettings(family="tag36h12")
     with pytest.raises(CoopenvError, match="encoding: 'yuv444' is none of mono8"):
