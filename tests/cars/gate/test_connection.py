@@ -1,4 +1,4 @@
-"""A gate on a network within this process, and its codec, which reads and writes the bytes that rosbags does."""
+"""A gate on a network within this process."""
 
 from __future__ import annotations
 
@@ -7,25 +7,18 @@ import tracemalloc
 from collections import Counter
 from collections.abc import Callable
 from random import Random
-from typing import Any
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from coopenv.base.errors import CoopenvError
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.gate.gate import ARM, BOOL, COMMAND, STATUS, Gate, GateMode, Reason
+from coopenv.cars.gate.gate import Gate, GateMode, Reason
 from coopenv.cars.gate.process import GateConnection, run
 from coopenv.cars.gate.wheel_command import NEUTRAL, MotionCommand, write_drive
 from coopenv.cars.link.clock import CLOCK
-from coopenv.cars.messages.cdr import Malformed, read, write
-from coopenv.cars.messages.codec import decode, encode, header, make
+from coopenv.cars.messages.codec import decode
 from coopenv.cars.settings.profile import SVEA, Role
 from tests.cars.gate import messages
 from tests.cars.gate.bench import CAR, LIMITS, OTHER, STATION, Bench, messages_of_strangers
-from tests.cars.gate.messages import arm, framed_command, stop
 from tests.cars.gate.station import Station
 
 
@@ -146,97 +139,3 @@ def test_no_bad_message_is_accepted_or_kept() -> None:
     # Not a number in a genuine command has closed it at the first; the station's next command goes on.
     assert bench.tick() == NEUTRAL and bench.gate.state is GateMode.TIMED_OUT
     assert bench.drive(1).speed > 0.0
-
-
-TEXT = st.text(st.characters(codec="utf-8"), max_size=12)
-STAMP = st.integers(0, 2**31 * 10**9 - 1)
-FLOAT = st.floats(width=32)
-USUAL = st.floats(-1e6, 1e6, width=32)
-COUNT = st.integers(0, 2**64 - 1)
-
-
-@given(STAMP, TEXT, st.tuples(FLOAT, FLOAT, FLOAT, FLOAT, FLOAT))
-def test_commands_are_read_as_they_were_written(stamp: int, frame: str, fields: Any) -> None:
-    found = read(framed_command(stamp, frame, fields), COMMAND)
-    assert found[:2] == [stamp, frame]
-    assert np.array_equal(found[2:], fields, equal_nan=True)
-
-
-@given(STAMP, TEXT, TEXT, TEXT, st.booleans())
-def test_armings_are_read_as_they_were_written(stamp: int, frame: str, session: str, nonce: str, armed: bool) -> None:
-    message = make(SVEA.topics[Role.ARM].type, header=header(stamp, frame), session=session, nonce=nonce, armed=armed)
-    assert read(encode(message), ARM) == [stamp, frame, session, nonce, armed]
-
-
-@pytest.mark.parametrize("value", [True, False])
-def test_stops_are_those_of_rosbags(value: bool) -> None:
-    assert write("?", value) == stop(value)
-    assert read(stop(value), BOOL) == [value]
-
-
-@given(STAMP, st.lists(USUAL, min_size=12, max_size=12), st.integers(0, 2**16 - 1), st.integers(0, 255))
-def test_manual_control_is_that_of_rosbags(stamp: int, numbers: list[float], buttons: int, extensions: int) -> None:
-    given = iter([*numbers[:4], buttons, buttons // 2, extensions, *numbers[4:]])
-    neutral = {name: (kind, next(given)) for name, (kind, _) in SVEA.command.neutral.items()}
-    message, drive = SVEA.command.model_copy(update={"neutral": neutral}), MotionCommand(0.1, -0.2)
-    fields = message.values(drive)
-    payload = write_drive(stamp, message, drive)
-    assert payload == encode(make(SVEA.topics[Role.MANUAL].type, header=header(stamp), **fields))
-    found = decode(payload, SVEA.topics[Role.MANUAL].type)
-    assert all(getattr(found, k) == pytest.approx(v, rel=1e-6) for k, v in fields.items())
-
-
-@given(STAMP, TEXT, TEXT, TEXT, COUNT, COUNT, st.dictionaries(TEXT, COUNT, max_size=5))
-def test_the_status_is_that_of_rosbags(
-    stamp: int, session: str, nonce: str, state: str, accepted: int, last: int, counts: dict[str, int]
-) -> None:
-    lists = [*counts], [*counts.values()]
-    payload = write(STATUS, stamp, "", session, nonce, state, accepted, last, *lists)
-    fields: dict[str, Any] = {"session": session, "nonce": nonce, "state": state}
-    fields |= {"accepted": accepted, "last_sequence": last}
-    fields |= {"rejections": list(counts), "counts": np.array(list(counts.values()), dtype=np.uint64)}
-    assert payload == encode(make(SVEA.topics[Role.GATE].type, header=header(stamp), **fields))
-    found = decode(payload, SVEA.topics[Role.GATE].type)
-    assert dict(zip(found.rejections, found.counts.tolist(), strict=True)) == counts
-
-
-WHOLE = [
-    (COMMAND, Role.COMMAND, framed_command(5, "abc:1", (0.1, 0.2, 0.3, 0.4, 0.5))),
-    (ARM, Role.ARM, arm(7, "abc", "nonce")),
-    (BOOL, Role.STOP, stop()),
-]
-
-
-@pytest.mark.parametrize(("fields", "role", "payload"), WHOLE)
-def test_every_other_length_is_refused(fields: tuple[str, ...], role: Role, payload: bytes) -> None:
-    for length in range(len(payload)):
-        with pytest.raises(Malformed):
-            read(payload[:length], fields)
-        with pytest.raises(CoopenvError):
-            decode(payload[:length], SVEA.topics[role].type)
-    for more in range(1, 4):  # padding that some writers add
-        assert read(payload + bytes(more), fields) == read(payload, fields)
-    with pytest.raises(Malformed, match="too long"):
-        read(payload + bytes(4), fields)
-
-
-@given(st.sampled_from(WHOLE), st.binary(max_size=80), st.booleans())
-def test_bytes_are_read_as_rosbags_reads_them_or_refused(what: Any, raw: bytes, plausible: bool) -> None:
-    fields, role, _ = what
-    payload = b"\0\1\0\0" + raw if plausible else raw
-    try:
-        found = read(payload, fields)
-    except Malformed:
-        return
-    other = decode(payload, SVEA.topics[role].type)
-    if role is Role.STOP:
-        assert found == [bool(other.data)]
-    else:
-        assert found[1] == other.header.frame_id
-
-
-def test_stamps_and_texts_that_make_no_sense_are_refused() -> None:
-    good = framed_command(5, "abc:1", (0.0,) * 5)
-    for place, byte in ((11, 0xFF), (12, 0xFF), (15, 0x7F), (16, 0xC3), (21, 0x31), (1, 0)):
-        with pytest.raises(Malformed):
-            read(good[:place] + bytes([byte]) + good[place + 1 :], COMMAND)

@@ -7,9 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import warp as wp
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
@@ -18,9 +15,8 @@ from coopenv.cars.messages import codec
 from coopenv.cars.messages.readings import READERS, CarPose, CarStatus, Detections, Twist, read
 from coopenv.cars.messages.vision import Calibration, rays
 from coopenv.cars.settings.profile import SVEA, Role
-from coopenv.estimation.lens import distort, largest_radius, undistort
+from coopenv.estimation.lens import distort
 from coopenv.observers.contract import Message
-from coopenv.world.camera import undistort as simulated
 
 pytest.importorskip("rosbags", reason="needs the extra 'svea'")
 
@@ -289,69 +285,6 @@ def test_absurd_values_are_one_line(role: Role, made: Any, line: str) -> None:
 def test_every_topic_of_a_car_that_is_no_command_can_be_read() -> None:
     commands = {Role.COMMAND, Role.ARM, Role.GATE, Role.STOP, Role.MANUAL}
     assert all(topic.type in READERS[role] for role, topic in SVEA.topics.items() if role not in commands)
-
-
-FISH = (-0.4, 0.0, 0.001, -0.002, 0.0)  # folds back beyond a radius of 0.91
-CUSHION = (0.3, 0.1, 0.0, 0.001, 0.02)
-
-
-@wp.struct
-class Lens:
-    k1: wp.float64
-    k2: wp.float64
-    p1: wp.float64
-    p2: wp.float64
-    k3: wp.float64
-
-
-@wp.kernel
-def undistort_all(lens: Lens, points: wp.array(dtype=wp.vec2d), found: wp.array(dtype=wp.vec2d)):  # type: ignore[valid-type]
-    i = wp.tid()
-    x, y = simulated(lens, points[i][0], points[i][1])
-    found[i] = wp.vec2d(x, y)
-
-
-coordinates = st.floats(-0.7, 0.7)
-
-
-@settings(max_examples=60)
-@given(
-    st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=7), st.sampled_from([DISTORTION, FISH, CUSHION])
-)
-def test_undistorted_points_are_imaged_where_they_were(points: list[tuple[float, float]], distortion: Any) -> None:
-    true = np.array(points)
-    true = true[np.linalg.norm(true, axis=1) < 0.95 * min(largest_radius(distortion), 9.0)]
-    found, there = undistort(distort(true, distortion), distortion)
-    assert there.all()
-    assert_allclose(found, true, atol=1e-8)
-
-
-def test_the_simulator_undistorts_alike() -> None:
-    points = np.random.default_rng(2).uniform(-0.45, 0.45, (50, 2))
-    found, there = undistort(points, DISTORTION)
-    lens = Lens()
-    for name, value in zip(("k1", "k2", "p1", "p2", "k3"), DISTORTION, strict=True):
-        setattr(lens, name, value)
-    out = wp.zeros(50, dtype=wp.vec2d, device="cpu")
-    wp.launch(undistort_all, dim=50, inputs=[lens, wp.array(points, dtype=wp.vec2d, device="cpu"), out], device="cpu")
-    assert there.all()
-    assert_allclose(found, out.numpy(), atol=2e-5)  # whose fixed-point iteration stops after 20 rounds
-
-
-def test_points_that_no_ray_gives_are_reported() -> None:
-    reach = largest_radius(FISH)
-    farthest = float(distort(np.array([[reach, 0.0]]), (*FISH[:2], 0.0, 0.0, 0.0))[0, 0])
-    points = np.array([[0.1, 0.2], [farthest + 0.05, 0.0], [np.nan, 0.0], [0.0, 50.0]])
-    found, there = undistort(points, FISH)
-    assert there.tolist() == [True, False, False, False]
-    assert_allclose(distort(found[:1], FISH), points[:1], atol=1e-12)
-
-
-def test_far_points_of_a_lens_without_end_are_found() -> None:
-    true = np.array([[3.0, -4.0], [0.0, 12.0], [1e-9, 0.0]])
-    found, there = undistort(distort(true, CUSHION), CUSHION)
-    assert there.all()
-    assert_allclose(found, true, atol=1e-6)
 
 
 def test_rays_of_pixels_go_right_and_down() -> None:

@@ -19,7 +19,6 @@ from coopenv.cars.messages.codec import make
 from coopenv.cars.messages.readings import Detections, read
 from coopenv.cars.messages.vision import Calibration, find_tags, frame_of
 from coopenv.cars.settings.profile import Role, VisionSettings
-from coopenv.estimation.lens import distort, undistort
 from coopenv.observers import run
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
@@ -33,18 +32,6 @@ LENSES = {
     "rational": (0.3, -0.1, 0.001, -0.0007, 0.02, 0.6, 0.05, 0.003),
     "fisheye": (-0.03, 0.01, -0.004, 0.001),
 }
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_lenses_are_those_of_opencv(name: str) -> None:
-    flat, d = np.random.default_rng(0).uniform(-0.8, 0.8, (200, 2)), np.array(LENSES[name])
-    points = np.concatenate([flat, np.ones((200, 1))], axis=-1)[:, None]
-    project = cv2.fisheye.projectPoints if len(d) == 4 else cv2.projectPoints
-    expected = project(points, np.zeros(3), np.zeros(3), np.eye(3), d)[0].reshape(-1, 2)
-    np.testing.assert_allclose(distort(flat, LENSES[name]), expected, atol=1e-12)
-    found, there = undistort(expected, LENSES[name])
-    assert there.all()
-    np.testing.assert_allclose(found, flat, atol=1e-9)
 
 
 @pytest.mark.parametrize(
