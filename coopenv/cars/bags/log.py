@@ -129,9 +129,7 @@ def value_reader(
         if isinstance(value, CarPose):
             return in_frame(value, frames.get(entry.role, given.frames.map))
         if isinstance(value, Twist):
-            value = given.corrections.get(entry.car, right).twist(value)
-            if entry.role is Role.WHEEL and entry.car in turning:
-                return Twist(value.linear, None)  # the IMU knows better
+            return given.corrections.get(entry.car, right).twist(value, entry.role, entry.car in turning)
         return value
 
     return read_value

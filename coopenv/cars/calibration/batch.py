@@ -217,10 +217,15 @@ class Batch:
         car, own, start, keys = self.cars[c], x[self.own(c)], near[self.own(c)], self.keys[c]
         path = self.path(c, x)
         place, yaw = pose[:, 0] + 1j * pose[:, 1], pose[:, 2]
-        when = car.time + start[CAMERA_TIME]
-        k = self.nearest(c, when)
-        moved, turned = path.step(keys[k], when, own[CAMERA_TIME] - start[CAMERA_TIME])
-        at, heading = place[k] + np.exp(1j * yaw[k]) * moved, yaw[k] + turned
+
+        def carried(time: Array, offset: int) -> tuple[NDArray[np.complex128], Array]:
+            """Return places and headings at times whose offset is a constant."""
+            when = time + start[offset]
+            k = self.nearest(c, when)
+            moved, turned = path.step(keys[k], when, own[offset] - start[offset])
+            return place[k] + np.exp(1j * yaw[k]) * moved, yaw[k] + turned
+
+        at, heading = carried(car.time, CAMERA_TIME)
         points = self.places + x[self.markers : self.frame].reshape(-1, 3)
         point = points[car.target]
         flat = np.exp(-1j * heading) * (point[:, 0] + 1j * point[:, 1] - at)
@@ -230,10 +235,7 @@ class Batch:
         step, bend = path.step(keys[:-1], keys[1:])
         gap = np.exp(-1j * yaw[:-1]) * np.diff(place) - step
         odometry = np.stack([gap.real, gap.imag, np.diff(yaw) - bend], axis=-1)
-        when = car.truth_time + start[TRUTH_TIME]
-        k = self.nearest(c, when)
-        moved, turned = path.step(keys[k], when, own[TRUTH_TIME] - start[TRUTH_TIME])
-        at, heading = place[k] + np.exp(1j * yaw[k]) * moved, yaw[k] + turned
+        at, heading = carried(car.truth_time, TRUTH_TIME)
         offset, frame = own[BODY], x[self.frame :]
         at = at + np.exp(1j * heading) * (offset[1] + 1j * offset[2])
         at = np.exp(1j * frame[0]) * at + frame[1] + 1j * frame[2]

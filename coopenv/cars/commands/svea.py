@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from coopenv.cars.link.transport import Transport
 
 in_deployment = partial(typer.Argument, metavar="DEPLOYMENT.toml", callback=options.existing("deployment"))
+Fleet = Annotated[Path, in_deployment(help="Deployment of the fleet.")]
+CarName = Annotated[str, typer.Option(help="Name of the car, as in the deployment.")]
 GateConnect = Annotated[
     str | None,
     typer.Option(
@@ -95,8 +97,8 @@ def demo(
 
 @svea.command()
 def fake(
-    deployment: Annotated[Path, in_deployment(help="Deployment of the fleet.")],
-    car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
+    deployment: Fleet,
+    car: CarName,
     seed: options.Seed = 0,
     fault: Annotated[
         list[str] | None,
@@ -188,8 +190,8 @@ def gate(
 
 @svea.command()
 def health(
-    deployment: Annotated[Path, in_deployment(help="Deployment of the fleet.")],
-    car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
+    deployment: Fleet,
+    car: CarName,
     connect: GateConnect = None,
     off_board: OffBoard = False,
     patience: Annotated[float, typer.Option(min=0.1, help="Longest wait for it, s.")] = 2.0,
@@ -275,8 +277,8 @@ def next_message(transport: "Transport", topic: str, kind: str, patience: float)
 
 @svea.command()
 def see(
-    deployment: Annotated[Path, in_deployment(help="Deployment of the fleet.")],
-    car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
+    deployment: Fleet,
+    car: CarName,
     connect: GateConnect = None,
     off_board: OffBoard = False,
     patience: Annotated[float, typer.Option(min=0.1, help="Longest wait for the calibration of its camera, s.")] = 5.0,

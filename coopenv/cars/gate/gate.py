@@ -78,7 +78,7 @@ class GateClock:
 
 PERIOD = 50_000_000  # ns between outputs
 TIMEOUT = 200_000_000  # ns without a valid command after which the car gets neutral
-MOST_AHEAD = 50_000_000  # ns that a stamp may lie in the future
+MOST_AHEAD = 50_000_000  # ns that a stamp may be ahead of the receiver's clock, here and at the station
 MOST_BYTES = 512  # of a message to the gate; its own have less than 300
 MOST_DIGITS = 18  # of a sequence number
 

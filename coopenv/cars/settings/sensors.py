@@ -50,9 +50,9 @@ class Correction(Section):
         names = ("focal_length", "principal_point", "distortion")
         return replace(lens, **{name: value for name in names if (value := getattr(self, name)) is not None})
 
-    def twist(self, twist: "Twist") -> "Twist":
-        """Return a measured twist without its errors."""
-        v, w = twist.linear, twist.angular
+    def twist(self, twist: "Twist", role: Role, by_imu: bool) -> "Twist":
+        """Return a measured twist without its errors; `by_imu`: turn rates are the IMU's, not the wheels'."""
+        v, w = twist.linear, None if by_imu and role is Role.WHEEL else twist.angular
         linear = None if v is None else v / (1.0 + self.wheel_scale)
         return replace(twist, linear=linear, angular=None if w is None else w - (0.0, 0.0, self.gyro_bias))
 

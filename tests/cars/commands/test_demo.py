@@ -21,14 +21,13 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from coopenv.base.errors import CoopenvError, DataWarning
-from coopenv.cars.backend.backend import open_svea
+from coopenv.cars.backend.backend import Svea, open_svea
 from coopenv.cars.backend.station import Gates, Pacer
 from coopenv.cars.commands.demo import FLEETS, Demo, links_line, links_report
 from coopenv.cars.commands.svea import STOPPED
-from coopenv.cars.fake.car import fault_topic
 from coopenv.cars.fake.fleet import fakes as fake_processes
 from coopenv.cars.fake.fleet import free_port
-from coopenv.cars.fake.lockstep import Hub
+from coopenv.cars.fake.lockstep import Hub, LockstepFakes
 from coopenv.cars.link.zenoh import open_zenoh
 from coopenv.cars.messages.codec import encode, header, make
 from coopenv.cars.settings.limits import USUAL
@@ -38,8 +37,7 @@ from coopenv.estimation.observability import Trajectory
 from coopenv.runs.command import execute, report
 from coopenv.runs.rollouts import Rollout
 from coopenv.viz.trajectories import trajectory_figure_2d
-from tests.helpers.cars import OVERTAKING, cars, fakes, write_fleet
-from tests.helpers.cars import PATIENT as BUSY
+from tests.helpers.cars import OVERTAKING, PATIENT, cars, fakes, send_fault, write_fleet
 from tests.helpers.commands import refused
 from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, mentioning, start, wait_until
 from tests.helpers.wire import free_endpoint
@@ -104,18 +102,6 @@ def test_an_interrupt_ends_all_processes_and_keeps_the_drive(moment: str, tmp_pa
         assert "Stopped: Interrupted" in printed and "warning" not in errors
 
 
-@pytest.mark.slow
-def test_a_fleet_of_ones_own_is_driven(tmp_path: Path) -> None:
-    mine = tmp_path / "mine.toml"
-    mine.write_text(SHIPPED.read_text())
-    printed = driven_demo(tmp_path, "--fleet", "mine.toml", "--set", "horizon=3")
-    assert "horizon reached at 3 s" in printed
-    assert (tmp_path / "out" / "mine" / "metrics.json").exists() and (tmp_path / "out" / "mine.mcap").exists()
-    mine.write_text(mine.read_text().replace("fakes = true", ""))
-    refused = CliRunner().invoke(app, ["svea", "demo", "--fleet", str(mine)])
-    assert refused.exit_code != 0 and "fakes = true is missing" in str(refused.exception)
-
-
 @pytest.fixture
 def fleet_of_my_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], list[str]]:
     """Return the command of a demo whose deployment has further settings."""
@@ -174,7 +160,7 @@ ENOUGH = 200_000
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str]]:
-    path = write_fleet(tmp_path_factory.mktemp("fleet"), safety=BUSY)
+    path = write_fleet(tmp_path_factory.mktemp("fleet"), safety=PATIENT)
     with fake_processes(path) as router:
         yield path, router
 
@@ -225,9 +211,6 @@ def test_a_station_that_is_killed_leaves_its_drive(fleet: tuple[Path, str], tmp_
     assert "ended before its time" in printed and "RMSE" in printed
 
 
-PATIENT = "odometry_age = 2.0\nmissed_deadlines = 60\n"
-
-
 def test_a_fleet_has_an_environment() -> None:
     line = refused("svea", "demo", "--fleet", "mine.toml", "--environment", "svea_crossing")
     assert "--environment: mine.toml names one; give --environment or --fleet" in line
@@ -246,19 +229,22 @@ def test_cars_that_say_nothing_are_named(tmp_path: Path, monkeypatch: pytest.Mon
     assert str(too_short.exception).startswith("steady_from 2 is not within the run of ")
 
 
-@pytest.mark.slow
-def test_a_car_that_is_killed_ends_the_run_with_a_status_of_its_own(tmp_path: Path) -> None:
-    mine = tmp_path / "mine.toml"
-    mine.write_text(SHIPPED.read_text().replace("[safety]\n", f"[safety]\n{PATIENT}"))
-    with fake_processes(mine) as endpoint:
-        command = ("svea", "run", "mine.toml", "--connect", endpoint, "--arm", "--policy", "route_follower")
-        station = start((*COOPENV, *command, "--record", "drive.mcap", "--no-figures"), tmp_path)
-        wait_until(lambda: (tmp_path / "drive.mcap").exists() and (tmp_path / "drive.mcap").stat().st_size > ENOUGH)
-        with closing(open_zenoh("client", [endpoint])) as here:
-            here.publish(fault_topic("svea1"), encode(make("std_msgs/msg/String", data="kill@0")), reliable=True)
-            printed, errors = station.communicate(timeout=DEADLOCK)
-    assert station.returncode == STOPPED, errors
-    assert "Stopped: svea1: " in printed and "ended before its time" in printed
+def test_a_car_that_freezes_ends_the_run_with_a_status_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = LockstepFakes(write_fleet(tmp_path))
+
+    def opened(_path: Path, environment: None, overrides: Any, car: None, record: Path, connect: None) -> Svea:
+        return made.station(environment, overrides=overrides, car=car, record=record)
+
+    monkeypatch.setattr("coopenv.cars.backend.backend.open_svea", opened)
+    send_fault(made.hub, "svea1", "freeze@3")
+    command = ["svea", "run", "fleet.toml", "--arm", "--policy", "route_follower", "--record", "drive.mcap"]
+    result = CliRunner().invoke(app, [*command, "--no-figures"])
+    assert result.exit_code == STOPPED, (result.output, result.exception)
+    assert "Stopped: svea1: " in result.output and "ended before its time" in result.output
+    assert Path("drive.mcap").stat().st_size > ENOUGH
 
 
 NEAR = {"vehicles.vehicle_1.goal.radius": 3.7, "horizon": 9.0}
