@@ -98,45 +98,40 @@ def test_a_lost_public_file_is_made_again(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o601])
-def test_a_private_file_open_to_others_is_refused(folder: Path, mode: int) -> None:
-    path = folder / "svea7.pem"
-    path.chmod(mode)
-    with pytest.raises(KeyFileError, match=f"chmod 600 {path}"):
+def test_files_open_to_others_are_refused(folder: Path, mode: int) -> None:
+    (folder / "svea7.pem").chmod(mode)
+    with pytest.raises(KeyFileError, match=f"chmod 600 {folder / 'svea7.pem'}"):
         load_signer(folder, "svea7")
-
-
-def test_public_keys_that_others_can_change_are_refused(folder: Path) -> None:
     (folder / PUBLIC).chmod(0o664)
     with pytest.raises(KeyFileError, match="chmod go-w"):
         load_verifier(folder)
 
 
-def test_a_file_of_another_user_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, stranger = folder / "svea7.pem", os.geteuid() + 4711
-    if os.geteuid() == 0:
-        os.chown(path, stranger, -1)
-    else:
-        monkeypatch.setattr(os, "geteuid", lambda: stranger)
-    with pytest.raises(KeyFileError, match="belongs to another user"):
-        load_signer(folder, "svea7")
-
-
-def test_pipes_and_folders_are_refused_as_keys(folder: Path) -> None:
+def test_files_of_another_user_pipes_and_folders_are_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, make in (("pipe", os.mkfifo), ("folder", os.mkdir)):
         make(folder / f"{name}.pem", 0o600)
         with pytest.raises(KeyFileError, match="no plain file"):
             load_signer(folder, name)
     with pytest.raises(KeyFileError, match=r"nobody\.pem: cannot be read .*coopenv svea keys"):
         load_signer(folder, "nobody")
+    stranger = os.geteuid() + 4711
+    if os.geteuid() == 0:
+        os.chown(folder / "svea7.pem", stranger, -1)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: stranger)
+    with pytest.raises(KeyFileError, match="belongs to another user"):
+        load_signer(folder, "svea7")
 
 
-@pytest.mark.parametrize("text", ["", "-----BEGIN PRIVATE KEY-----\nsecret\n-----END PRIVATE KEY-----\n", "\0\xff"])
+MALFORMED_KEY = "-----BEGIN PRIVATE KEY-----\nsecret\n-----END PRIVATE KEY-----\n"
+
+
+@pytest.mark.parametrize("text", ["", MALFORMED_KEY, "\0\xff"])
 def test_a_malformed_key_is_refused_and_not_quoted(folder: Path, text: str) -> None:
     (folder / "svea7.pem").write_text(text)
     with pytest.raises(KeyFileError, match="no private key") as raised:
         load_signer(folder, "svea7")
-    assert "secret" not in str(raised.value)
-    assert raised.value.__cause__ is None
+    assert "secret" not in str(raised.value) and raised.value.__cause__ is None
 
 
 @pytest.mark.parametrize("text", ["", "keys = 3", "[keys]\nsvea7 = 3", "[keys]\n'a/b' = 'x'", "[keys", "[keys]\na='!'"])
@@ -194,15 +189,10 @@ STATION = Signer("station", KEYS["station"])
 TOPICS = st.text(st.characters(codec="utf-8"), max_size=30)
 
 
-@given(TOPICS, st.binary(max_size=200), st.sampled_from(sorted(KEYS)))
-def test_the_signer_is_named(topic: str, payload: bytes, name: str) -> None:
-    attachment = Signer(name, KEYS[name]).sign(topic, payload)
-    assert VERIFIER.signer(topic, payload, attachment) == name
-
-
 @given(TOPICS, st.binary(max_size=60), TOPICS, st.binary(max_size=60))
 def test_a_signature_is_for_one_topic_and_one_payload(topic: str, payload: bytes, other: str, more: bytes) -> None:
     attachment = STATION.sign(topic, payload)
+    assert VERIFIER.signer(topic, payload, attachment) == "station"
     if (other, more) != (topic, payload):
         assert VERIFIER.signer(other, more, attachment) is None
     if other:
