@@ -31,7 +31,7 @@ from coopenv.cars.settings.profile import Role
 from coopenv.cars.settings.sensors import Correction, Sensors
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Message, sealed
-from coopenv.observers.recording import Sensed, Truth, is_due
+from coopenv.observers.sensed import Sensed, Truth, is_due
 
 NS = 1e-9
 

@@ -28,7 +28,7 @@ from coopenv.cars.messages.v2x import estimate_message, report_message
 from coopenv.cars.settings.deployment import Deployment, load_deployment
 from coopenv.cars.settings.profile import RESET_TOPIC, VELOCITY, Role, presence_of
 from coopenv.estimation.poses import left_covariance
-from coopenv.observers.recording import Sensed
+from coopenv.observers.sensed import Sensed
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.files import OVERRIDES
 from coopenv.sources.base import EPISODE_OVER, Capabilities, Command, Health, VehicleBroadcast

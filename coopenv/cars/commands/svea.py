@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cli import options
+from coopenv.cli import arguments, commands, options
 
 if TYPE_CHECKING:
     from coopenv.cars.link.transport import Transport
 
-in_deployment = partial(typer.Argument, metavar="DEPLOYMENT.toml", callback=options.existing("deployment"))
+in_deployment = partial(typer.Argument, metavar="DEPLOYMENT.toml", callback=arguments.existing("deployment"))
 Fleet = Annotated[Path, in_deployment(help="Deployment of the fleet.")]
 CarName = Annotated[str, typer.Option(help="Name of the car, as in the deployment.")]
 GateConnect = Annotated[
@@ -45,7 +45,7 @@ Station = Annotated[
     ),
 ]
 
-svea = options.group("SVEA cars, real ones and fakes.")
+svea = commands.group("SVEA cars, real ones and fakes.")
 HARMED = 1
 """Exit status of an attack that got through."""
 STOPPED = 3
@@ -447,7 +447,7 @@ class SveaRunOptions:
 
 
 @svea.command()
-@options.command
+@commands.command
 def run(given: SveaRunOptions) -> None:
     """Run an environment on cars: observers estimate, a policy drives, tables and figures follow.
 

@@ -21,7 +21,7 @@ from coopenv.cars.settings.deployment import Car, Sensors
 from coopenv.cars.settings.profile import SVEA, Role
 from coopenv.estimation.poses import exp_so3
 from coopenv.observers.contract import Message
-from coopenv.observers.recording import Sensed
+from coopenv.observers.sensed import Sensed
 from coopenv.scenario import Scenario
 from coopenv.sources.base import VehicleBroadcast
 from tests.helpers.builders import landmark, scenario, vehicle

@@ -33,7 +33,7 @@ from coopenv.cars.messages.codec import encode, header, make
 from coopenv.cars.settings.limits import USUAL
 from coopenv.cars.settings.profile import SVEA, Role
 from coopenv.cli.app import app
-from coopenv.estimation.observability import Trajectory
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.command import execute, report
 from coopenv.runs.rollouts import Rollout
 from coopenv.viz.trajectories import trajectory_figure_2d
