@@ -16,9 +16,9 @@ import pytest
 from pettingzoo.test import parallel_api_test
 
 import coopenv
-from coopenv.cars.codec import decode
-from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.transport import Arrival
+from coopenv.cars.link.transport import Arrival
+from coopenv.cars.messages.codec import decode
+from coopenv.cars.settings.profile import SVEA, Role
 from tests.helpers.cars import LAB, LAB_CARS, cars, fakes, write_fleet
 
 Env = coopenv.CooperativeLocalisationEnv
