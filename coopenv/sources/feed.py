@@ -23,11 +23,11 @@ from coopenv.world.camera import (
     sight_of,
 )
 from coopenv.world.dynamics import ARRIVED, COLLIDED, depart, move, referee, touches_anything
-from coopenv.world.embedded import Source, arrange_world, look_around, sense_nothing
+from coopenv.world.embedded import Source, arrange_world, begin_sensing, look_around, sense_nothing
 from coopenv.world.model import Precision
 from coopenv.world.nearby import NOT_A_NEIGHBOUR, sort_into_cells
 from coopenv.world.odometry import measure_odometry
-from coopenv.world.reset import begin_sensing, place_bodies, set_initial_estimate
+from coopenv.world.reset import place_bodies, set_initial_estimate
 from coopenv.world.route import UNDER_WAY
 from coopenv.world.state import allocate, array, fields
 from coopenv.world.v2x import draw_faults, transmit
@@ -93,7 +93,7 @@ def explain(model: Any, state: Any, world: int, vehicle: int):
 
 @wp.func
 def recall(model: Any, state: Any, record: Any, world: int, tick: int):
-    """Write the measurements of a tick, and the known truth."""
+    """Write the measurements of a tick, the messages that arrive, and the known truth."""
     row = row_of(record, tick)
     for landmark in range(model.landmarks):
         state.position[world, landmark] = record.landmarks[row, landmark]
@@ -119,12 +119,12 @@ def recall(model: Any, state: Any, record: Any, world: int, tick: int):
     sort_into_cells(model, state, world)
     for vehicle in range(model.vehicles):  # now that all poses are those of this tick
         explain(model, state, world, vehicle)
+    retransmit(model, state, record, world, tick, row)
 
 
 @wp.func
-def retransmit(model: Any, state: Any, record: Any, world: int, tick: int):
+def retransmit(model: Any, state: Any, record: Any, world: int, tick: int, row: int):
     """Write which messages arrive at a tick, by the source or else by the scenario's radio."""
-    row = row_of(record, tick)
     if record.inbox_tick[row, 0, 0] == BY_RADIO:
         for receiver in range(model.vehicles):
             transmit(model, state, world, receiver, tick)
@@ -144,7 +144,6 @@ def resense(model: Any, state: Any, record: Any, world: int, tick: int):
     recall(model, state, record, world, tick)
     for vehicle in range(model.vehicles):
         referee(model, state, world, vehicle)
-    retransmit(model, state, record, world, tick)
 
 
 @wp.func
@@ -170,7 +169,6 @@ def rewind(model: Any, state: Any, record: Any, world: int):
     recall(model, state, record, world, 0)
     for vehicle in range(model.vehicles):
         state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
-    retransmit(model, state, record, world, 0)
 
 
 @cache
