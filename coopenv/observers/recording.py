@@ -26,7 +26,7 @@ from coopenv.estimation.poses import (
     exp_so3,
     exp_translation,
 )
-from coopenv.observers.arrays import ARRAYS, KINDS_OF_TICKS, invalid_rows, misshapen, sizes_of
+from coopenv.observers.arrays import ARRAYS, KINDS_OF_TICKS, invalid_rows, misshapen, recorded_names, sizes_of
 from coopenv.observers.contract import Gains, ObserverInit, Received, SensorNoise, Setup, Tick, sealed
 from coopenv.scenario.learning import MOST, PARAMETERS
 from coopenv.scenario.schema import neighbour_sets, processing_order
@@ -61,6 +61,20 @@ class Measurements:
     bearings: Array  # (..., N, T, 3) camera -> target, body frame, NaN where not measured
     visible: NDArray[np.bool_]  # (..., N, T)
     landmarks: Array  # (..., L, 3) map, m
+    pan: Array | None = None  # (..., N) rad, by which cameras are turned to the left; None: 0
+
+    def measured(self) -> dict[str, Array]:
+        """Return the arrays of this class that are there, by name."""
+        return {name: value for name in MEASURED if (value := getattr(self, name)) is not None}
+
+    def filled(self, name: str) -> Array:
+        """Return an array; if it is absent, one of the value that stands for it."""
+        value: Array | None = getattr(self, name)
+        if value is None:
+            ticks, sizes = self.visible.shape[:-2], {"N": self.visible.shape[-2], "T": self.visible.shape[-1]}
+            shape = ARRAYS[name].shape({**sizes, "L": self.landmarks.shape[-2]})
+            value = np.full((*ticks, *shape), ARRAYS[name].optional, ARRAYS[name].dtype)
+        return value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +88,6 @@ class Sensed(Measurements):
     index: int  # k
     dt: float  # s, between ticks
     due: bool = True  # whether the scenario's observer rate asks for a correction
-    pan: Array | None = None  # (N,) rad, by which cameras are turned to the left; None: 0
     time: float | None = None  # s since the reset on the source's clock; None: index * dt
     odometry_age: Array | None = None  # (N,) s since the last odometry sample; None: 0
     bearing_age: Array | None = None  # (N,) s since the frame was exposed; None: 0
@@ -139,7 +152,6 @@ class Recording(Measurements):
     start_position: Array  # (N, 3) map, m
     start_covariance: Array  # (N, 6, 6) LEFT coordinates
     truth: Truth  # of the K ticks
-    pan: Array | None = None  # (K, N) rad, by which cameras were turned to the left; None: never
     scenario: "Scenario | None" = None  # the world that was recorded; None for recorded robots
     drawn: Drawn | None = None  # None: not simulated
     interference: "Interference | None" = None  # of the world's faults with messages and observers; None: there is none
@@ -298,10 +310,13 @@ class Recording(Measurements):
 
     def at(self, k: int) -> Sensed:
         """Return the measurements of all vehicles at tick k."""
-        sensed = {name: getattr(self, name)[k] for name in PER_TICK}
+        sensed: dict[str, Any] = {name: values[k] for name, values in self.per_tick().items()}
         truth = Truth(self.truth.rotation[k], self.truth.position[k])
-        pan = None if self.pan is None else self.pan[k]
-        return Sensed(index=k, dt=self.dt, due=bool(self.due[k]), pan=pan, truth=truth, **sensed)
+        return Sensed(index=k, dt=self.dt, due=bool(self.due[k]), truth=truth, **sensed)
+
+    def per_tick(self) -> dict[str, Any]:
+        """Return by name the arrays that hold what was measured and received at every tick."""
+        return {**self.measured(), "inbox_tick": self.inbox_tick}
 
     def odometry_age(self, rate: float) -> Array:
         """Return (K,) the age of the last odometry sample at each tick, s; samples are taken at 0, 1 / rate, ... s."""
@@ -313,10 +328,9 @@ class Recording(Measurements):
         return Sensed(
             index=np.arange(self.ticks)[:, None],  # type: ignore[arg-type]
             dt=self.dt,
-            pan=self.pan,
             odometry_age=self.odometry_age(odometry_rate)[:, None],
             truth=self.truth,
-            **{name: getattr(self, name) for name in PER_TICK},
+            **self.per_tick(),
         )
 
     def tick(self, k: int, vehicle: int, messages: Mapping[int, Received]) -> Tick:
@@ -361,10 +375,12 @@ def is_due(index: ArrayLike, ratio: float) -> NDArray[np.bool_]:
 
 
 MEASURED = tuple(field.name for field in fields(Measurements))
-"""Arrays that every tick has."""
-PER_TICK = (*MEASURED, "inbox_tick")
-"""Arrays of a recording that every tick of it has."""
-ROWS_OF_MISSING = (*MEASURED[:6], "pan", "odometry_age", "bearing_age")
+"""Arrays of measurements."""
+REQUIRED = tuple(name for name in MEASURED if ARRAYS[name].optional is None)
+"""Arrays of measurements that every tick has."""
+ROWS_OF_MISSING = tuple(
+    name for name, spec in ARRAYS.items() if "N" in spec.axes and (name in MEASURED or not spec.recorded)
+)
 """Arrays of a tick of which the row of a missing vehicle is not read."""
 
 
@@ -382,7 +398,7 @@ def check_tick(tick: Sensed, index: int, observer_init: ObserverInit) -> None:
         raise CoopenvError(f"tick {index}: time: expected s since the reset, got {tick.time!r:.40}")
     names = [name for name, spec in ARRAYS.items() if spec.axes[0] == "K" and name != "due"]
     given = {name: attrgetter(name)(tick) for name in names if tick.truth is not None or "." not in name}
-    given = {name: value for name, value in given.items() if value is not None or name in MEASURED}
+    given = {name: value for name, value in given.items() if value is not None or name in REQUIRED}
     for problem in misshapen(given, sizes_of(observer_init.setups), KINDS_OF_TICKS):
         raise CoopenvError(f"tick {index}: {problem}")
     absent = given.get("missing", np.zeros(len(observer_init.setups), bool))
@@ -488,8 +504,8 @@ def _check_radio(r: Recording) -> None:
 
 def recorded_arrays(r: Recording) -> dict[str, Any]:
     """Return the arrays of a recording by name. Raises DataError: one has another shape or type than it should."""
-    names = [name for name, spec in ARRAYS.items() if spec.recorded and (name != "pan" or r.pan is not None)]
-    values = {name: attrgetter(name)(r) for name in names}
+    values = {name: attrgetter(name)(r) for name, spec in ARRAYS.items() if spec.recorded}
+    values = {name: value for name, value in values.items() if value is not None or ARRAYS[name].optional is None}
     for problem in misshapen(values, {"K": r.ticks, **sizes_of(r.setups)}, {kind: kind for kind in "fib"}):
         raise DataError(problem)
     return values
@@ -531,7 +547,8 @@ def _check_scenario(r: Recording) -> None:
     neighbours = neighbour_sets(s)
     for setup, targets in zip(r.setups, neighbours, strict=True):
         _require(setup.targets.tolist() == targets, f"scenario: {setup.name} has other neighbours than in its setup")
-    _require((s.action.pan is None) == (r.pan is None), "pan: as in the scenario, cameras turn or they do not")
+    for name in recorded_arrays(r).keys() ^ set(recorded_names(s)):
+        _require(False, f"{name}: a recording has this array if its scenario asks for it, and only then")
     rates, staleness = s.rates, np.inf if s.v2x.staleness is None else s.v2x.staleness
     _require(list(r.order) == processing_order(s, neighbours), "scenario: vehicles in another order than recorded")
     _require(r.dt == 1.0 / rates.camera, f"scenario: ticks of {1.0 / rates.camera:g} s, recorded {r.dt:g} s")

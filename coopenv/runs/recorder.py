@@ -21,7 +21,7 @@ from coopenv.estimation.observability import Trajectory
 from coopenv.estimation.poses import quaternion_wxyz
 from coopenv.evaluation.episodes import Views, play
 from coopenv.observers.mailbox import Interference, interference_of, stacked
-from coopenv.observers.recording import MEASURED, Drawn, Recording, Sensed, Truth, is_due
+from coopenv.observers.recording import Drawn, Recording, Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
 from coopenv.scenario import Scenario, ScenarioLike
 from coopenv.sources.base import Backend
@@ -65,8 +65,7 @@ def record(
         on_tick(engine, k)
         on_progress(k / scenario.horizon_ticks)
     L, observer_init = len(scenario.landmarks), engine.world.observer_init
-    names = MEASURED if scenario.action.pan is None else (*MEASURED, "pan")
-    kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in names}
+    kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in ticks[0].measured()}
     start_rotation = views["estimate_rotation"][0, 0]
     return Recording(
         setups=observer_init.setups,

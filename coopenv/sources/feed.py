@@ -226,17 +226,15 @@ class Feed:
         """Write a tick, or all ticks of a recording as one, and the twists that lead there from the truth before."""
         truth = tick.truth or unknown_truth(tick)
         linear, angular = mean_twists(before, truth, tick.dt)
-        age = np.zeros(1) if tick.odometry_age is None else np.asarray(tick.odometry_age)
-        missing = np.zeros(1, bool) if tick.missing is None else np.asarray(tick.missing)
+        age = tick.filled("odometry_age")
         sampled = (tick.index * tick.dt - age + 1e-9) * self._odometry_rate
-        just_before = ~missing & np.isfinite(age)  # the first tick
+        just_before = ~tick.filled("missing") & np.isfinite(age)  # the first tick
         samples = np.where((sampled >= 0.0) | just_before, np.floor(np.maximum(sampled, 0.0)) + 1, 0)
-        lag = np.zeros(1) if tick.bearing_age is None else np.asarray(tick.bearing_age) / tick.dt
+        lag = tick.filled("bearing_age") / tick.dt
         values = {
-            **{name: getattr(tick, name) for name in MEASURED},
+            **{name: tick.filled(name) for name in MEASURED},
             "samples": samples,
             "bearing_lag": np.round(np.minimum(lag, tick.index)),
-            "pan": 0.0 if tick.pan is None else tick.pan,
             "inbox_tick": BY_RADIO if tick.inbox_tick is None else tick.inbox_tick,
             "true_rotation": truth.rotation,
             "true_position": truth.position,
