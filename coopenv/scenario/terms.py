@@ -308,7 +308,7 @@ GROUPS = tuple(FIELDS)
 USUAL_GROUPS = ("estimate", "quality", "bearings", "odometry", "messages", "goal")
 """Groups of a scenario that names none."""
 VALUES = "coopenv.api.terms.records"
-"""Module that computes the values of the built-in fields and reward terms, in the order of their rows."""
+"""Module that computes the values of the built-in fields and reward terms."""
 
 OBSERVATION_FIELDS = Registry(
     "observation field",
