@@ -5,8 +5,8 @@ Numbers are float32 in worlds of either precision. A field of the observation ta
 terminations may take `TruthRecord`, reward terms `FleetRecord` too, and are then privileged. Observations therefore
 cannot leak truth.
 
-Values stand at the places of their rows in `coopenv.scenario.terms`, which `FieldPlace` and `RewardPlace` give by name, and in their
-units; the results kernel scales and clips them, or weighs them.
+Values stand at the places of their rows in `coopenv.scenario.terms`, which `FieldPlace` and `RewardPlace` give by name,
+and in their units; the results kernel scales and clips them, or weighs them.
 """
 
 from enum import IntEnum
