@@ -67,9 +67,9 @@ class Measurements:
         """Return the arrays of this class that are there, by name."""
         return {name: value for name in MEASURED if (value := getattr(self, name)) is not None}
 
-    def filled(self, name: str) -> Array:
+    def filled(self, name: str) -> NDArray[Any]:
         """Return an array; if it is absent, one of the value that stands for it."""
-        value: Array | None = getattr(self, name)
+        value: NDArray[Any] | None = getattr(self, name)
         if value is None:
             ticks, sizes = self.visible.shape[:-2], {"N": self.visible.shape[-2], "T": self.visible.shape[-1]}
             shape = ARRAYS[name].shape({**sizes, "L": self.landmarks.shape[-2]})

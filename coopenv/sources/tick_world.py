@@ -157,7 +157,7 @@ class TickWorld(SensingWorld):
 
     def _completed(self, tick: Sensed) -> Sensed:
         """Return a sealed tick without gaps: a missing vehicle continues with its last odometry."""
-        last, missing = self._present, tick.filled("missing").astype(bool)
+        last, missing = self._present, np.array(tick.filled("missing"), bool)
         ages = {name: tick.filled(name) for name in ("odometry_age", "bearing_age")}
         arrays: dict[str, Any] = {name: np.array(value, float) for name, value in (tick.measured() | ages).items()}
         arrays["visible"] = tick.visible.copy()
@@ -172,7 +172,7 @@ class TickWorld(SensingWorld):
         for values in arrays.values():
             values.setflags(write=False)
         due = bool(is_due(tick.index, self.model.observer.rate / self.scenario.rates.camera))
-        return replace(tick, **arrays, missing=missing, late=tick.filled("late").astype(bool), due=due)
+        return replace(tick, **arrays, missing=missing, late=np.array(tick.filled("late"), bool), due=due)
 
     def _receive(self) -> None:
         """Put messages from vehicles that are estimated elsewhere into the inboxes; malformed ones are as none."""
