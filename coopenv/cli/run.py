@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from coopenv.base.errors import CoopenvError, DataWarning
-from coopenv.cli import options
+from coopenv.cli import arguments, commands, options
 
 if TYPE_CHECKING:
     from coopenv.api.engine import Engine
@@ -48,7 +48,7 @@ class RunOptions(options.SourceOptions):
         return with_observer(super().changes, self.observer)
 
 
-@options.command
+@commands.command
 def run(given: RunOptions) -> None:
     """Run an environment; write metrics, arrays, figures and a page that plays the episode.
 
@@ -56,7 +56,7 @@ def run(given: RunOptions) -> None:
     """
     if given.environment.endswith(BUNDLE):
         others = {field.name for field in fields(given)} - {"environment", "as_json"}
-        options.refuse(given, others, f"is for a new run, {given.environment} is replayed as it was")
+        commands.refuse(given, others, f"is for a new run, {given.environment} is replayed as it was")
         replay(Path(given.environment), given.as_json)
         return
     name = Path(given.environment).stem
@@ -112,7 +112,7 @@ def replay(path: Path, as_json: bool = False) -> None:
 
 RunFolder = Annotated[
     Path,
-    typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.", callback=options.existing("run")),
+    typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.", callback=arguments.existing("run")),
 ]
 
 
@@ -163,7 +163,7 @@ class RecordOptions(options.SourceOptions):
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False
 
 
-@options.command
+@commands.command
 def record(given: RecordOptions) -> None:
     """Write what vehicles sense to an MCAP file, and beside it a page that plays the episode.
 
@@ -250,7 +250,7 @@ Exported = Annotated[
     typer.Argument(
         metavar="RUN|FILE.mcap",
         help="Folder that `coopenv run` has written, or log of `record`.",
-        callback=options.existing("run or log"),
+        callback=arguments.existing("run or log"),
     ),
 ]
 LAYOUT_FILE = "foxglove_layout.json"

@@ -17,11 +17,12 @@ from coopenv.api.terms.layout import action_space, observation_layout, observati
 from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import check_new, replace_text, replacing_folder, writing
 from coopenv.base.installation import environment, install_command, needing, version
-from coopenv.estimation.observability import Trajectory
 from coopenv.estimation.poses import quaternion_wxyz
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.evaluation.episodes import Views, play
-from coopenv.observers.mailbox import Interference, interference_of, stacked
-from coopenv.observers.recording import Drawn, Recording, Sensed, Truth, is_due
+from coopenv.observers.faults import Interference, interference_of, stacked
+from coopenv.observers.recording import Drawn, Recording
+from coopenv.observers.sensed import Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
 from coopenv.scenario import Scenario, ScenarioLike
 from coopenv.sources.base import Backend

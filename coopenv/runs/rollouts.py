@@ -15,8 +15,9 @@ from coopenv.base.errors import CoopenvError, explained
 from coopenv.base.installation import version
 from coopenv.estimation import Outcome, Sight
 from coopenv.estimation.metrics import CONVERGED, mean_targets_in_view, observability_of, steady_mean, summarise
-from coopenv.estimation.observability import ConvergenceRates, Observability, Trajectory, convergence_rates, least_mean
+from coopenv.estimation.observability import ConvergenceRates, Observability, convergence_rates, least_mean
 from coopenv.estimation.poses import position_covariance, roll_pitch_yaw_deg
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.evaluation.episodes import Views, estimated_here, play
 from coopenv.policies import Policy, load_policy
 from coopenv.scenario import Scenario, ScenarioLike, load_scenario

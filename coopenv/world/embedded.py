@@ -11,12 +11,14 @@ from typing import Any
 import warp as wp
 
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.poses import Coordinates, Rule
+from coopenv.estimation.poses import Coordinates
+from coopenv.estimation.validity import Rule
 from coopenv.world.camera import observe
-from coopenv.world.dynamics import depart, move, move_landmarks, referee, touches_anything
+from coopenv.world.dynamics import move, move_landmarks
 from coopenv.world.model import Precision
 from coopenv.world.nearby import sort_into_cells
 from coopenv.world.odometry import draw_errors, measure_odometry
+from coopenv.world.referee import depart, referee, touches_anything
 from coopenv.world.reset import place_bodies, set_initial_estimate
 from coopenv.world.route import appear, direct_traffic
 from coopenv.world.v2x import draw_faults, transmit
@@ -168,7 +170,7 @@ def send_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int, 
 
 
 HOST = Embedded("host", estimate_nothing, start_nothing, send_nothing)
-"""Placeholder for an observer that runs on the host (`coopenv.api.engine.PlugIns`)."""
+"""Placeholder for an observer that runs on the host (`coopenv.api.plugins.PlugIns`)."""
 
 
 @device_function

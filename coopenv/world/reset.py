@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import exp_so3, identity3, join6, orthonormalise
-from coopenv.world.dynamics import command_of, prescribe, touches_one_of
+from coopenv.world.dynamics import command_of, prescribe
 from coopenv.world.model import DRIVEN, PRESCRIBED
 from coopenv.world.nearby import clear_cells, clear_entries, put_into_cell
 from coopenv.world.quality import empty_block
@@ -29,6 +29,7 @@ from coopenv.world.random import (
     uniform,
     unit_vector,
 )
+from coopenv.world.referee import touches_one_of
 from coopenv.world.route import draw_route, go_straight, has_routes, start_on_route
 from coopenv.world.v2x import NOTHING, POSE_BYTES, first_tick_of
 

@@ -10,7 +10,8 @@ from numpy.testing import assert_array_equal
 from coopenv import CoopenvError
 from coopenv.observers.arrays import ARRAYS
 from coopenv.observers.contract import SensorNoise
-from coopenv.observers.recording import Recording, Sensed, check_tick
+from coopenv.observers.recording import Recording
+from coopenv.observers.sensed import Sensed, check_tick
 
 MEASURED_ITSELF = {
     *("rotation", "translation", "velocity", "angular_velocity", "bearings", "pan"),

@@ -18,7 +18,7 @@ from coopenv import DataError
 from coopenv.cli.app import main
 from coopenv.mrclam.recording import load_dataset, recording_of
 from coopenv.observers import Recording, run
-from coopenv.observers.recording import Truth
+from coopenv.observers.sensed import Truth
 from coopenv.scenario import parse_scenario
 from coopenv.sources.mcap import read_recording, write_recording
 from coopenv.sources.mcap_container import Container

@@ -1,12 +1,12 @@
-"""Records from which terms are computed, one vehicle at the end of a decision, and the values of the built-in terms.
+"""Records from which terms are computed, one vehicle at the end of a decision, and values of built-in fields.
 
 Numbers are float32 in worlds of either precision. A field of the observation takes `Ego`, and `Target`, `Neighbour` or
 `MapLandmark`. These depend on the truth only through measurements, received messages and actions. Only reward terms and
 terminations may take `TruthRecord`, reward terms `FleetRecord` too, and are then privileged. Observations therefore
 cannot leak truth.
 
-Values stand at the places of their rows in `coopenv.scenario.terms`, which `FieldPlace` and `RewardPlace` give by name,
-and in their units; the results kernel scales and clips them, or weighs them.
+Values stand at the places of their rows in `coopenv.scenario.terms`, which `FieldPlace` gives by name, and in their
+units; the results kernel scales and clips them.
 """
 
 from enum import IntEnum
@@ -14,8 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
-from coopenv.world.dynamics import COLLIDED, OFF_ROUTE
+from coopenv.scenario.terms import OBSERVATION_FIELDS
 
 LOG10_E = wp.constant(0.4342944819032518)
 FORESIGHT = wp.constant(6.0)
@@ -152,11 +151,8 @@ for _name, _row in OBSERVATION_FIELDS.built_in.items():
 VehicleValues, TargetValues, NeighbourValues, LandmarkValues = (
     wp.types.vector(size, wp.float32) for size in _sizes.values()
 )
-RewardValues = wp.types.vector(len(REWARD_TERMS.built_in), wp.float32)
 FieldPlace: Any = IntEnum("FieldPlace", SOURCES)
 """First place of a built-in field by its name, for kernels."""
-RewardPlace: Any = IntEnum("RewardPlace", {name: place for place, name in enumerate(REWARD_TERMS.built_in)})
-"""Place of a built-in reward term by its name, for kernels."""
 
 
 @wp.func
@@ -288,37 +284,4 @@ def landmark_values(landmark: MapLandmark) -> LandmarkValues:
     values[FieldPlace.map_mask] = wp.float32(landmark.exists)
     values[FieldPlace.map_in_view] = wp.float32(landmark.expected)
     values[FieldPlace.map_age] = landmark.age
-    return values
-
-
-@wp.func
-def per_metre(ego: Ego, excess: wp.float32, most: wp.float32):
-    """Return minus an excess in [0, most] for every metre gained, and `most` for every metre that is missed."""
-    paid = wp.where(excess < most, wp.max(excess, 0.0), most)  # NaN costs the most
-    return -(paid * ego.metres_gained + most * ego.metres_missed)
-
-
-@wp.func
-def reward_values(ego: Ego, truth: TruthRecord) -> RewardValues:
-    """Return the values of the reward terms, without weights."""
-    threshold, cap = ego.uncertainty_threshold, ego.uncertainty_cap
-    shortfall = ego.observability_level - ego.soft_observability
-    largest_shortfall = wp.max(ego.observability_level - ego.observability_floor, 0.0)
-    values = RewardValues()
-    values[RewardPlace.progress] = truth.progress
-    values[RewardPlace.arrival] = wp.float32(ego.arrived)
-    values[RewardPlace.collision] = wp.where(ego.outcome == COLLIDED, -1.0, 0.0)
-    values[RewardPlace.off_route] = wp.where(ego.outcome == OFF_ROUTE, -1.0, 0.0)
-    values[RewardPlace.control] = -ego.effort
-    values[RewardPlace.time] = -ego.elapsed
-    values[RewardPlace.radio] = -0.001 * wp.float32(ego.bytes_sent)
-    values[RewardPlace.position_error] = -truth.position_error
-    values[RewardPlace.orientation_error] = -(truth.orientation_error / DEGREES)
-    values[RewardPlace.position_uncertainty] = per_metre(ego, ego.position_std - threshold, cap)
-    values[RewardPlace.position_error_per_metre] = per_metre(ego, truth.position_error - threshold, cap)
-    values[RewardPlace.information_gain] = ego.information_gained
-    values[RewardPlace.uncertainty] = -ego.log_determinant / 6.0
-    values[RewardPlace.observability] = log10(wp.max(ego.gramian_min_eigenvalue, EIGENVALUE_FLOOR))
-    values[RewardPlace.observability_shortfall] = per_metre(ego, shortfall, largest_shortfall)
-    values[RewardPlace.visibility] = wp.float32(ego.targets_in_view) / wp.float32(wp.max(ego.possible_targets, 1))
     return values

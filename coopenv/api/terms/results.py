@@ -1,9 +1,11 @@
 """The results of a step: observation, reward, flags, quality of the estimate; one kernel per precision.
 
-The kernel computes the values of all built-in terms and reads from a table which of them an observation holds. User
+The kernel computes the values of all built-in terms and reads from a table which of them an observation holds. Values
+of reward terms stand at the places of their rows in `coopenv.scenario.terms`, which `RewardPlace` gives by name. User
 terms have kernels of their own (`own.py`), which read the records that this kernel writes for them.
 """
 
+from enum import IntEnum
 from functools import cache
 from typing import Any
 
@@ -22,6 +24,7 @@ from coopenv.api.terms.geometry import (
 from coopenv.api.terms.layout import Layout, entries_of, included_fields
 from coopenv.api.terms.records import (
     DEGREES,
+    EIGENVALUE_FLOOR,
     SOURCES,
     Ego,
     MapLandmark,
@@ -29,8 +32,8 @@ from coopenv.api.terms.records import (
     Target,
     TruthRecord,
     landmark_values,
+    log10,
     neighbour_values,
-    reward_values,
     target_values,
     vehicle_values,
 )
@@ -47,6 +50,7 @@ from coopenv.world.quality import (
     position_variance,
     targets_in_view,
 )
+from coopenv.world.referee import COLLIDED, OFF_ROUTE
 from coopenv.world.route import UNDER_WAY, remaining_way
 from coopenv.world.state import FLAG, NUMBER, array, whole
 from coopenv.world.warp_internals import device_function
@@ -222,6 +226,44 @@ def is_over(model: Any, state: Any, world: int) -> bool:
         if state.ended[world, vehicle] == UNDER_WAY:
             return False
     return True
+
+
+RewardValues = wp.types.vector(len(REWARD_TERMS.built_in), wp.float32)
+RewardPlace: Any = IntEnum("RewardPlace", {name: place for place, name in enumerate(REWARD_TERMS.built_in)})
+"""Place of a built-in reward term by its name, for kernels."""
+
+
+@wp.func
+def per_metre(ego: Ego, excess: wp.float32, most: wp.float32):
+    """Return minus an excess in [0, most] for every metre gained, and `most` for every metre that is missed."""
+    paid = wp.where(excess < most, wp.max(excess, 0.0), most)  # NaN costs the most
+    return -(paid * ego.metres_gained + most * ego.metres_missed)
+
+
+@wp.func
+def reward_values(ego: Ego, truth: TruthRecord) -> RewardValues:
+    """Return the values of the reward terms, without weights."""
+    threshold, cap = ego.uncertainty_threshold, ego.uncertainty_cap
+    shortfall = ego.observability_level - ego.soft_observability
+    largest_shortfall = wp.max(ego.observability_level - ego.observability_floor, 0.0)
+    values = RewardValues()
+    values[RewardPlace.progress] = truth.progress
+    values[RewardPlace.arrival] = wp.float32(ego.arrived)
+    values[RewardPlace.collision] = wp.where(ego.outcome == COLLIDED, -1.0, 0.0)
+    values[RewardPlace.off_route] = wp.where(ego.outcome == OFF_ROUTE, -1.0, 0.0)
+    values[RewardPlace.control] = -ego.effort
+    values[RewardPlace.time] = -ego.elapsed
+    values[RewardPlace.radio] = -0.001 * wp.float32(ego.bytes_sent)
+    values[RewardPlace.position_error] = -truth.position_error
+    values[RewardPlace.orientation_error] = -(truth.orientation_error / DEGREES)
+    values[RewardPlace.position_uncertainty] = per_metre(ego, ego.position_std - threshold, cap)
+    values[RewardPlace.position_error_per_metre] = per_metre(ego, truth.position_error - threshold, cap)
+    values[RewardPlace.information_gain] = ego.information_gained
+    values[RewardPlace.uncertainty] = -ego.log_determinant / 6.0
+    values[RewardPlace.observability] = log10(wp.max(ego.gramian_min_eigenvalue, EIGENVALUE_FLOOR))
+    values[RewardPlace.observability_shortfall] = per_metre(ego, shortfall, largest_shortfall)
+    values[RewardPlace.visibility] = wp.float32(ego.targets_in_view) / wp.float32(wp.max(ego.possible_targets, 1))
+    return values
 
 
 @wp.func
