@@ -22,7 +22,7 @@ from coopenv.estimation.trajectory import Trajectory
 from coopenv.evaluation.episodes import Views, play
 from coopenv.observers.faults import Interference, interference_of, stacked
 from coopenv.observers.recording import Drawn, Recording
-from coopenv.observers.sensed import MEASURED, Sensed, Truth, is_due
+from coopenv.observers.sensed import Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
 from coopenv.scenario import Scenario, ScenarioLike
 from coopenv.sources.base import Backend
@@ -66,8 +66,7 @@ def record(
         on_tick(engine, k)
         on_progress(k / scenario.horizon_ticks)
     L, observer_init = len(scenario.landmarks), engine.world.observer_init
-    names = MEASURED if scenario.action.pan is None else (*MEASURED, "pan")
-    kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in names}
+    kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in ticks[0].measured()}
     start_rotation = views["estimate_rotation"][0, 0]
     return Recording(
         setups=observer_init.setups,

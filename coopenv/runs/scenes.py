@@ -19,15 +19,13 @@ from coopenv.base.installation import install_command, list_envs
 from coopenv.evaluation.episodes import play
 from coopenv.observers import run
 from coopenv.observers.recording import Recording
-from coopenv.observers.registry import find, named, observer_of_robots, states_covariance, with_observer
+from coopenv.observers.registry import named, observer_of_robots, states_covariance
 from coopenv.policies import Policy, agents_for, find_agent, load_policy
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.scenario import Scenario
 from coopenv.sources.base import Backend
 from coopenv.sources.mcap import log_views, write_recording
 from coopenv.sources.registry import kind_of
-from coopenv.sources.selection import WHOLE, Selection
-from coopenv.sources.sources import open_backend
 from coopenv.viz.scene import SCENE_FILE, Frame, Origin, SceneRecord
 
 BASELINE = "route_follower"
@@ -159,27 +157,6 @@ def driver_of(
             except CoopenvError:
                 name = "zero"
     return load_policy(name, scenario, seed), Path(name).name
-
-
-def open_source(
-    name: str,
-    overrides: Mapping[str, Any],
-    observer: str | None = None,
-    data: Path | None = None,
-    variant: str | None = None,
-    topics: Path | None = None,
-    selection: Selection = WHOLE,
-) -> Backend:
-    """Return the source of ticks of a name: an environment, a log file, a bag or a data set.
-
-    Raises:
-        CoopenvError: there is no such thing, or it is of a form that cannot be opened.
-    """
-    if observer is not None:
-        find(named(observer))  # before anything is read
-    return open_backend(
-        name, None, with_observer(overrides, observer), data, variant, topics=topics, selection=selection
-    )
 
 
 def title_of(name: str) -> str:
