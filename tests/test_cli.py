@@ -27,7 +27,7 @@ from coopenv.sources.mcap import write_recording
 from tests.helpers.commands import refused
 from tests.helpers.env_suite import ALIKE, each_slow
 
-FILES = {"metrics.json", "trajectory.npz", "scene.npz", "record.zip"}
+FILES = {"metrics.json", "trajectory.npz", "scene.npz"}
 FIGURES = {"errors.png", "trajectories_2d.png", "trajectories_3d.png"}
 FIGURES |= {"topology.png", "consistency.png", "observability.png"}
 
@@ -170,9 +170,7 @@ def test_run_as_json_prints_nothing_else(capsys: pytest.CaptureFixture[str], tmp
     captured = capsys.readouterr()
     printed = json.loads(captured.out)
     assert "the policy has no effect" in captured.err
-    assert printed["files"] == [
-        f"out/overtaking/{name}" for name in ("metrics.json", "trajectory.npz", "scene.npz", "record.zip")
-    ]
+    assert printed["files"] == [f"out/overtaking/{name}" for name in ("metrics.json", "trajectory.npz", "scene.npz")]
     folder = tmp_path / "out" / "overtaking"
     assert {path.name for path in folder.iterdir()} == FILES
     assert json.loads((folder / "metrics.json").read_text()) == {k: v for k, v in printed.items() if k != "files"}

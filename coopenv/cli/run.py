@@ -1,12 +1,11 @@
-"""`coopenv run`, `record`, `bundle`, `figures` and `export`."""
+"""`coopenv run`, `record`, `figures` and `export`."""
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -50,15 +49,7 @@ class RunOptions(options.SourceOptions):
 
 @options.command
 def run(given: RunOptions) -> None:
-    """Run an environment; write metrics, arrays, figures and a page that plays the episode.
-
-    The file of an earlier run, which `coopenv bundle` wrote, runs again and is compared.
-    """
-    if given.environment.endswith(BUNDLE):
-        others = {field.name for field in fields(given)} - {"environment", "as_json"}
-        options.refuse(given, others, f"is for a new run, {given.environment} is replayed as it was")
-        replay(Path(given.environment), given.as_json)
-        return
+    """Run an environment; write metrics, arrays, figures and a page that plays the episode."""
     name = Path(given.environment).stem
     refuse_for_recordings(given.environment, seed=given.seed, policy=given.policy)
     backend = given.open()
@@ -89,52 +80,10 @@ def run(given: RunOptions) -> None:
         options.show_page(page) if page in result.files else options.show(folder)
 
 
-BUNDLE = ".zip"
-
-
-def replay(path: Path, as_json: bool = False) -> None:
-    """Run a bundle again. Raises CoopenvError: it is not valid, or something else comes out."""
-    from coopenv.runs.bundle import Bundle
-
-    bundle, printed = Bundle.read(path), options.console()
-    if others := bundle.other_versions():
-        options.console(stderr=True).print(f"note: made with {', '.join(others)}", soft_wrap=True)
-    if differing := bundle.replay():
-        raise CoopenvError(f"{path}: the result differs from the file's: {'; '.join(differing)}")
-    if as_json:
-        options.print_json(bundle.manifest.model_dump(include={"environment", "seed", "policy", "observer", "end"}))
-        return
-    printed.print(f"{path}: {bundle.title}", soft_wrap=True)
-    end = bundle.manifest.end
-    same = "The same figures up to the driver's error" if end.by_driver else "The same error"
-    printed.print(f"{same}: {end.error}" if end.error else "The same figures.", soft_wrap=True)
-
-
 RunFolder = Annotated[
     Path,
     typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.", callback=options.existing("run")),
 ]
-
-
-def bundle(
-    run: RunFolder,
-    out: Annotated[Path | None, typer.Option(help="File to write (default: RUN.zip).")] = None,
-) -> None:
-    """Write a run, or one that failed, to one file, which `coopenv run` replays."""
-    from shutil import copyfile
-
-    from coopenv.base.files import replacing_file
-    from coopenv.runs.bundle import RECORD_FILE, Bundle
-
-    if run.is_dir() and not (run / RECORD_FILE).is_file():
-        raise CoopenvError(f"{run}: holds no {RECORD_FILE}, as only simulated runs do; send the recording instead")
-    found = Bundle.read(run / RECORD_FILE)
-    file = out or run.with_name(f"{run.name}{BUNDLE}")
-    with replacing_file(file) as new:
-        copyfile(found.path, new)
-    options.console().print(
-        f"{file}: {found.title}. It runs again with: coopenv run {quote(str(file))}", soft_wrap=True
-    )
 
 
 def refuse_for_recordings(environment: str, seed: int, policy: str) -> None:
