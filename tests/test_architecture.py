@@ -17,6 +17,7 @@ ROOMS = (
     ("world",),
     ("observers",),
     ("sources", "backends"),
+    ("episode",),
     ("viz",),
     ("api",),
     ("policies",),

@@ -21,6 +21,7 @@ from coopenv.api.terms.results import MEMORY, results_struct, results_table, ste
 from coopenv.base.columns import facts_html, one_line, picture_html
 from coopenv.base.errors import CoopenvError, Explained, check_memory, error_text, training_seed, world_keys
 from coopenv.base.installation import load_reference
+from coopenv.episode import Frame
 from coopenv.estimation.poses import Coordinates, riccati_covariance
 from coopenv.observers.contract import Estimate
 from coopenv.observers.group import ObserverError, ObserverGroup
@@ -31,7 +32,6 @@ from coopenv.scenario import Scenario
 from coopenv.sources.base import Backend, SensingWorld
 from coopenv.sources.sources import simulation_of
 from coopenv.sources.tick_world import open_world
-from coopenv.viz.scene import Frame
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
 from coopenv.world.model import device_memory

@@ -19,6 +19,7 @@ from coopenv.base.files import check_file, replace_text, replacing_file, writing
 from coopenv.base.format import json_text, number
 from coopenv.base.installation import environment_id, list_envs, version
 from coopenv.bench.cards import OVERVIEW, Contest, cells, rendered
+from coopenv.episode import Episode, Origin
 from coopenv.evaluation.metrics import SCORE
 from coopenv.policies import agents_for
 from coopenv.runs import scenario_text
@@ -28,7 +29,6 @@ from coopenv.runs.scenes import driver_of, scene_of
 from coopenv.runs.summary import cell_text, environment_rows, facts, shown_sections
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import REWARD_TERMS, TERMINATION_CONDITIONS
-from coopenv.viz.scene import Origin, SceneRecord
 from coopenv.viz.topview import TopView
 
 FORMATS, MOST_BYTES = ((6.0, 448), (3.0, 320), (3.0, 240)), 280_000
@@ -86,7 +86,7 @@ def write_page_films(name: str, scenario: Scenario, folder: Path, on_progress: C
 
 
 def _write_small(
-    film: Callable[[int], list[list[Shot]]], path: Path, record: SceneRecord, on_progress: Callable[[float], None]
+    film: Callable[[int], list[list[Shot]]], path: Path, record: Episode, on_progress: Callable[[float], None]
 ) -> None:
     """Write the film of a width in the first of the formats that makes no larger file."""
     for fps, width in FORMATS:

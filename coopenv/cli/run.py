@@ -14,7 +14,7 @@ from coopenv.base.errors import CoopenvError, DataWarning
 from coopenv.cli import options
 
 if TYPE_CHECKING:
-    from coopenv.api.engine import Engine
+    pass
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,15 +120,14 @@ def record(given: RecordOptions) -> None:
     """
     from coopenv.base.files import check_new
     from coopenv.runs.console import Progress
-    from coopenv.runs.recorder import record as recorded
+    from coopenv.runs.recorder import record_episode
     from coopenv.runs.scenes import (
         MOST_SHOWN,
-        Keeper,
+        frame_stride,
         observer_of,
         open_source,
         pages_can_be_written,
         played_scene,
-        source_of,
         title_of,
         write_log,
         write_page,
@@ -144,13 +143,7 @@ def record(given: RecordOptions) -> None:
     if given.topics is not None and "topics" not in kind.options:
         raise CoopenvError(f"--map {given.topics}: is for ROS bags, {environment} is none")
     refuse_for_recordings(environment, given.seed, given.policy)
-    log, keepers = options.console(stderr=True), list[Keeper]()
-
-    def keep(engine: Engine, tick: int) -> None:
-        if not keepers:
-            keepers.append(Keeper(engine, source_of(engine, out.name, given.seed, given.policy)))
-        keepers[0].tick(tick)
-
+    log, played = options.console(stderr=True), None
     if kind.reader:
         if given.changes:
             raise CoopenvError(f"--override: is for a simulation, {environment} is recorded")
@@ -158,16 +151,15 @@ def record(given: RecordOptions) -> None:
     else:
         backend = given.open()
         with Progress(log, "recording", total=1.0) as progress:
-            recording = recorded(backend, given.seed, given.policy, progress.update, keep)
+            episode = record_episode(backend, given.seed, given.policy, progress.update, name=out.name)
+        recording, played = episode.recording, episode.drawn(frame_stride(episode.scenario))
     write_log(recording, out, log, observer, given.scene)
     count = len(recording.setups)
     facts = f"{count} vehicle{'' if count == 1 else 's'}, {recording.ticks} ticks, {recording.t[-1]:g} s"
     options.console().print(f"{out}: {facts}", soft_wrap=True)
     if given.no_replay or not pages_can_be_written(page, log):
         return
-    if keepers:
-        played = keepers[0].record()
-    else:
+    if played is None:
         with warnings.catch_warnings(action="ignore", category=DataWarning):  # these have been printed
             shown = observer or observer_of(recording)
             backend = open_source(environment, {}, shown, given.data, given.variant, selection=given.selection)
@@ -246,7 +238,7 @@ def export(
         _export_layout(source, out or Path(LAYOUT_FILE))
         return
     from coopenv.runs.command import Results
-    from coopenv.runs.recorder import write_tum
+    from coopenv.runs.exports import write_tum
 
     results = Results.read(source)
     if file_format in (ExportFormat.csv, ExportFormat.parquet):

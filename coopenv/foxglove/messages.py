@@ -16,13 +16,13 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.format import jsonable
+from coopenv.episode import semi_axes
 from coopenv.estimation.poses import Array, covariance_in_map
 from coopenv.observers import Run
 from coopenv.observers.recording import Recording
 from coopenv.scenario.bodies import Body
 from coopenv.sources.mcap_format import LogClock, View, codec, ros_definition
 from coopenv.viz.perspective import pixels
-from coopenv.viz.scene import semi_axes
 from coopenv.viz.stage import Stage, roads, ways
 from coopenv.viz.style import DARK_BLUE, INK, vehicle_colour
 from coopenv.viz.topview_ground import ASPHALT, ROOF

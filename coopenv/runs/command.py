@@ -18,6 +18,7 @@ from coopenv.base.files import replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import install_command
 from coopenv.base.terminal import Terminal, text_of
+from coopenv.episode import SCENE_FILE
 from coopenv.estimation.metrics import shown_note, shown_vehicles, steady_start
 from coopenv.estimation.observability import Observability, Trajectory, analyse_observability
 from coopenv.observers.contract import Factory
@@ -27,13 +28,12 @@ from coopenv.runs import console as lines
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.films import VIDEO_FILES, top_view_film, video_path, write_film
 from coopenv.runs.rollouts import Rollout, estimates, run_metrics, theory_rates, vehicle_metrics
-from coopenv.runs.scenes import Keeper, frame_stride, source_of, write_page
+from coopenv.runs.scenes import frame_stride, write_page
 from coopenv.scenario import Scenario, ScenarioLike, load_scenario
 from coopenv.sources.base import Repeating
 from coopenv.sources.selection import Selection
 from coopenv.sources.sources import open_backend, source_name
 from coopenv.viz import FIGURE_NAMES, FORMATS
-from coopenv.viz.scene import SCENE_FILE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -82,21 +82,21 @@ def execute(
     with nullcontext() if out is None else replacing_folder(out, result_names()) as folder:
         with compile_notice(log):
             run.engine.load()
-        keeper = Keeper(run.engine, source_of(run.engine, name, run.seed, run.policy_name))
+        stride = frame_stride(scenario)
         with Progress(log, doing, run.ticks_planned, paced) as progress:
             for tick in run.play():
-                if keeper.tick(tick):
+                if tick % stride == 0:
                     progress.update(tick, describe() if describe is not None else None)
             if check is not None:
                 check()
-            trajectory = run.trajectory()
-            results, observability = _figures_of(name, overrides, run, trajectory, steady)
+            episode = run.episode(name)
+            results, observability = _figures_of(name, overrides, run, episode.trajectory, steady)
         if folder is None or out is None:
             return results
-        scene = keeper.record()
+        scene = episode.drawn(stride)
         paths = [folder / METRICS_FILE, folder / TRAJECTORY_FILE, folder / SCENE_FILE]
         replace_text(paths[0], json_text(results.metrics))
-        trajectory.save(paths[1])
+        episode.trajectory.save(paths[1])
         scene.save(paths[2])
         if figures is not None and observability is not None:
             with Progress(log, "drawing figures"):
@@ -107,7 +107,7 @@ def execute(
         if video:
             paths.append(video_path(folder))
             with Progress(log, f"filming {paths[-1].name}", 1.0) as progress:
-                fps = scenario.rates.camera / frame_stride(scenario)
+                fps = scenario.rates.camera / stride
                 write_film(top_view_film(scene), paths[-1], fps, width=None, on_progress=progress.update)
             if paths[-1].suffix == ".gif":
                 log.print(f"video: written as GIF; for MP4: {install_command('video')}", soft_wrap=True)

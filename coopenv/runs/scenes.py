@@ -16,19 +16,20 @@ from rich.console import Console
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, list_envs
+from coopenv.episode import SCENE_FILE, Episode, EpisodeRecorder, Origin
 from coopenv.evaluation.episodes import play
 from coopenv.observers import run
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import find, named, states_covariance, with_observer
 from coopenv.policies import Policy, agents_for, find_agent, load_policy
 from coopenv.runs.console import Progress, compile_notice
+from coopenv.runs.recorder import source_of
 from coopenv.scenario import Scenario
 from coopenv.sources.base import Backend
 from coopenv.sources.mcap import log_views, write_recording
 from coopenv.sources.registry import kind_of
 from coopenv.sources.selection import WHOLE, Selection
 from coopenv.sources.sources import open_backend
-from coopenv.viz.scene import SCENE_FILE, Frame, Origin, SceneRecord
 
 BASELINE = "route_follower"
 LOOKING = ("look_ahead", "peek")
@@ -42,43 +43,13 @@ def frame_stride(scenario: Scenario) -> int:
     return scenario.ticks_per_decision * max(1, ceil(scenario.rates.decision / MAX_FPS - 1e-9))
 
 
-def source_of(engine: Engine, name: str, seed: int | None, policy: str) -> Origin:
-    """Return the heading of a scene; a recording has no seed and no driver, a prescribed motion no driver."""
-    scenario, recorded = engine.backend.scenario, engine.backend.capabilities.recorded
-    driver = policy if scenario.driven and not recorded else ""
-    return Origin.of(name, scenario, policy=driver, seed=None if recorded else seed)
-
-
-class Keeper:
-    """Keeps the frames of an episode that pictures are made of, at most `MAX_FPS` a second."""
-
-    def __init__(self, engine: Engine, source: Origin) -> None:
-        """Begin with none."""
-        self.engine, self._source = engine, source
-        self._stride = frame_stride(engine.backend.scenario)
-        self._frames: list[Frame] = []
-
-    def tick(self, tick: int) -> bool:
-        """Store the state at a tick if the tick is drawn; return whether it is."""
-        drawn = tick % self._stride == 0
-        if drawn:
-            self._frames.append(Frame.of(self.engine))
-        return drawn
-
-    def record(self) -> SceneRecord:
-        """Return the stored frames and the present one."""
-        if not self._frames or self.engine.view("tick")[0] > self._frames[-1].tick:
-            self._frames.append(Frame.of(self.engine))
-        return SceneRecord.of_frames(self.engine.backend.scenario, self._source, self._frames)
-
-
 def scene_of(
     engine: Engine,
     source: Origin,
     policy: Policy | None = None,
     on_progress: Callable[[float], None] = lambda share: None,
     longest: float = np.inf,
-) -> SceneRecord:
+) -> Episode:
     """Play an episode in the first world of an engine and return its scene.
 
     Args:
@@ -91,12 +62,16 @@ def scene_of(
     Raises:
         CoopenvError: the policy fails, or the backend cannot begin.
     """
-    keeper, scenario = Keeper(engine, source), engine.backend.scenario
-    ticks = int(min(scenario.horizon_ticks, longest * scenario.rates.camera))
+    recorder, scenario = EpisodeRecorder(engine), engine.backend.scenario
+    ticks, stride = int(min(scenario.horizon_ticks, longest * scenario.rates.camera)), frame_stride(scenario)
+    tick = 0
     for tick in play(engine, [source.seed or 0], ticks, policy, to_the_end=False):
-        if keeper.tick(tick):
+        if tick % stride == 0:
+            recorder.take()
             on_progress(tick / ticks)
-    return keeper.record()
+    if tick % stride:
+        recorder.take()
+    return recorder.episode(scenario, source)
 
 
 def played_scene(
@@ -107,7 +82,7 @@ def played_scene(
     policy: Policy | None = None,
     driver: str = "",
     longest: float = np.inf,
-) -> SceneRecord:
+) -> Episode:
     """Play an episode of a backend with progress shown and return its scene; arguments as for `scene_of`.
 
     `name` and `driver` stand in its heading.
@@ -119,7 +94,7 @@ def played_scene(
             return scene_of(engine, source_of(engine, name, seed, driver), policy, progress.update, longest)
 
 
-def saved_scene(name: str | Path) -> SceneRecord | None:
+def saved_scene(name: str | Path) -> Episode | None:
     """Return the scene in the folder of a run, or of a file `*.npz`; None: the name means something else.
 
     Raises:
@@ -129,9 +104,9 @@ def saved_scene(name: str | Path) -> SceneRecord | None:
     if str(name) in list_envs():
         return None  # a folder that is called like an environment is ./NAME
     if path.suffix == ".npz":
-        return SceneRecord.load(path)
+        return Episode.load(path)
     if (path / SCENE_FILE).is_file():
-        return SceneRecord.load(path / SCENE_FILE)
+        return Episode.load(path / SCENE_FILE)
     if any((path / kept).is_file() for kept in ("trajectory.npz", "metrics.json")):
         raise CoopenvError(f"{path}: has no {SCENE_FILE}, which `coopenv run` writes since 0.2; run it again")
     return None
@@ -188,7 +163,7 @@ def title_of(name: str) -> str:
     return path.name if kind_of(name).recorded else path.stem
 
 
-def write_page(record: SceneRecord, path: Path, log: Console, others: Mapping[str, str] | None = None) -> Path | None:
+def write_page(record: Episode, path: Path, log: Console, others: Mapping[str, str] | None = None) -> Path | None:
     """Write the page that plays a scene, with progress shown; None, and a line, where the extra `view` is missing.
 
     `others` are the pages of all drivers by their names, to which this one leads.

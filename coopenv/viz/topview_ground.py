@@ -16,13 +16,13 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation, Text
 from scipy.spatial.transform import Rotation
 
+from coopenv.episode import Frame
 from coopenv.estimation import Sight
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.scenario.routes import even_points
 from coopenv.scenario.schema import agent_starts
 from coopenv.viz import style
-from coopenv.viz.scene import Frame
 from coopenv.viz.stage import CORNERS, Stage, nose_shapes, outlines, paths, roads, vehicle_mark, ways
 from coopenv.viz.style import (
     DARK_BLUE,
