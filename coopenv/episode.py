@@ -16,7 +16,7 @@ from typing import Annotated, Any, Protocol, Self
 import numpy as np
 from pydantic import Field
 
-from coopenv.base.errors import DataError
+from coopenv.base.errors import CoopenvError, DataError
 from coopenv.base.files import replacing_file
 from coopenv.base.format import fixed, jsonable, read_npz
 from coopenv.base.sections import Section, validated
@@ -159,9 +159,9 @@ _SELDOM = frozenset(
 """Arrays that are mostly as at the tick before, which a record then holds once."""
 
 
-def row_of(shown: FrameSource, world: int = 0) -> dict[str, np.ndarray]:
+def row_of(shown: FrameSource, world: int = 0, more: Sequence[str] = ()) -> dict[str, np.ndarray]:
     """Return a copy of the arrays of a world of an engine at the present tick, by their names in an episode."""
-    names = [*(FIELDS.keys() - {"position_covariance"}), *_FURTHER]
+    names = [*(FIELDS.keys() - {"position_covariance"}), *_FURTHER, *more]
     row = {name: np.array(shown.view(VIEWS.get(name, name))[world]) for name in names}
     row["position_estimate"] = (row["rotation_estimate"] @ row["position_estimate"][..., None])[..., 0]
     return row
@@ -236,6 +236,13 @@ class Episode:
         return Frame.of_row({name: rows[k] for name, rows in self.rows.items()})
 
     @property
+    def measured(self) -> Recording:
+        """The recording of its measurements. Raises CoopenvError: nothing has been recorded."""
+        if self.recording is None:
+            raise CoopenvError(f"{self.source.name}: nothing has been recorded of what the vehicles measured")
+        return self.recording
+
+    @property
     def time(self) -> np.ndarray:
         """(K,) s since the start."""
         return np.asarray(self["tick"] / self.scenario.rates.camera)
@@ -292,8 +299,8 @@ class Episode:
         return cls(scenario, source, {name: [getattr(frame, name) for frame in frames] for name in FIELDS})
 
     @classmethod
-    def of_run(cls, scenario: Scenario, source: Origin, recording: Recording, run: Run) -> Self:
-        """Return the episode of a recording with the estimates of an observer that has run on it.
+    def of_run(cls, scenario: Scenario, name: str, recording: Recording, run: Run, observer: str) -> Self:
+        """Return the episode of a recording with the estimates of an observer, by its name, that has run on it.
 
         Nothing is known of rewards, goals, routes and other traffic; a target that is not measured is out of view.
         """
@@ -328,6 +335,7 @@ class Episode:
         }
         for name in ("velocity", "angular_velocity"):
             arrays[name] = np.concatenate([np.zeros((K, L, 3)), getattr(r, name)], axis=1)
+        source = Origin(name=name, observer=observer, honest=states_covariance(observer))
         return cls(scenario, source, arrays, recording)
 
     def save(self, path: Path) -> None:
@@ -363,7 +371,7 @@ class Episode:
         lengths = {"F": (count,), "K": (1, count), "N": (n,), "A": (n + len(scenario.landmarks),)}
         lengths["R"] = (len(source.terms),)
         stored = read_npz(path, "scene", {VIEWS.get(name, name): kinds for name, kinds in FIELDS.items()}, lengths)
-        rows = {}
+        rows: dict[str, Any] = {}
         for name in FIELDS:
             whole = stored[VIEWS.get(name, name)].astype(np.int64 if name in _WHOLE else np.float64)
             rows[name] = np.broadcast_to(whole, (count, *whole.shape[1:]))
@@ -376,16 +384,16 @@ class Episode:
 class EpisodeRecorder:
     """Takes the ticks of the first world of an engine; one whose copying was interrupted does not count."""
 
-    def __init__(self, shown: FrameSource) -> None:
-        """Begin with no tick."""
-        self._shown = shown
+    def __init__(self, shown: FrameSource, more: Sequence[str] = ()) -> None:
+        """Begin with no tick; `more` are fields of the engine that are recorded beside the usual ones."""
+        self._shown, self._more = shown, more
         self._rows: dict[str, list[np.ndarray]] = {}
         self.taken = 0
         """Number of ticks."""
 
     def take(self) -> None:
         """Copy the present tick."""
-        row = row_of(self._shown)
+        row = row_of(self._shown, more=self._more)
         for name, array in row.items():
             rows = self._rows.setdefault(name, [])
             del rows[self.taken :]

@@ -77,8 +77,9 @@ def write_page_films(name: str, scenario: Scenario, folder: Path, on_progress: C
         record = scene_of(engine, source, policy, lambda share: on_progress(share / 2))
     _write_small(lambda width: top_view_film(record, False), path, record, lambda share: on_progress(0.5 + share / 4))
     if scenario.driven and find_spec("pyvista"):
-        longest = int(np.isfinite(record.fields["position_error"]).sum(axis=0).argmax())
-        distance = np.abs(record.fields["position"][..., :2]).max(axis=-1)
+        longest = int(np.isfinite(record["position_error"]).sum(axis=0).argmax())
+        frames = [record.frame(k) for k in range(len(record))]
+        distance = np.abs([frame.target_position[:, :2] for frame in frames]).max(axis=-1)
         near = distance[:, len(scenario.landmarks) + longest] <= 1.1 * np.nanmax(distance[0])  # of all at the start
         inside = record.of(np.flatnonzero(near))
         behind = partial(space_film, [("", inside)], cameras=("follow",), vehicle=longest)

@@ -152,7 +152,7 @@ def record(given: RecordOptions) -> None:
         backend = given.open()
         with Progress(log, "recording", total=1.0) as progress:
             episode = record_episode(backend, given.seed, given.policy, progress.update, name=out.name)
-        recording, played = episode.recording, episode.drawn(frame_stride(episode.scenario))
+        recording, played = episode.measured, episode.drawn(frame_stride(episode.scenario))
     write_log(recording, out, log, observer, given.scene)
     count = len(recording.setups)
     facts = f"{count} vehicle{'' if count == 1 else 's'}, {recording.ticks} ticks, {recording.t[-1]:g} s"

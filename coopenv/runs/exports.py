@@ -3,20 +3,22 @@
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from io import StringIO
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
+from gymnasium.spaces import Box
 
 from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import action_space, observation_layout, observation_space
 from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import check_new, replace_text, replacing_folder, writing
 from coopenv.base.installation import environment, install_command, needing, version
+from coopenv.episode import Episode
 from coopenv.estimation.observability import Trajectory
 from coopenv.estimation.poses import quaternion_wxyz
 from coopenv.evaluation.episodes import Views, play
@@ -51,7 +53,8 @@ def write_tum(trajectory: Trajectory, folder: str | Path) -> list[Path]:
     return paths
 
 
-KEPT = ("observation", "actions", "reward", "terminated", "truncated", "position_error")
+STEPS = ("observation", "actions", "reward", "terminated", "truncated")
+"""Arrays of an engine that a dataset is made of, beside those of an episode."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ class DrivenEpisode:
     observations: np.ndarray
     """(T + 1, D) float32, from the start to the last."""
     actions: np.ndarray
-    """(T, A) float32 in [-1, 1]."""
+    """(T, A) float32 in [-1, 1]; of a recording the measured velocities, m/s and rad/s."""
     rewards: np.ndarray
     """(T,)."""
     terminations: np.ndarray
@@ -72,6 +75,23 @@ class DrivenEpisode:
     """(T,) bool: the horizon cut it off."""
     position_error: np.ndarray
     """(T + 1,) m, against the truth."""
+
+    @classmethod
+    def of(cls, kept: Mapping[str, np.ndarray], world: int, name: str, actions: np.ndarray) -> Self:
+        """Return the episode of a vehicle from its arrays (K, ...) by name, and the actions (K - 1, A) between rows."""
+        ended = (kept["terminated"] + kept["truncated"])[1:] > 0
+        length = int(next(iter(np.flatnonzero(ended)), len(ended) - 1)) + 1
+        after, whole = slice(1, length + 1), slice(length + 1)
+        return cls(
+            world=world,
+            vehicle=name,
+            observations=kept["observation"][whole].astype(np.float32),
+            actions=actions[:length].astype(np.float32),
+            rewards=kept["reward"][after].astype(float),
+            terminations=kept["terminated"][after].astype(bool),
+            truncations=kept["truncated"][after].astype(bool),
+            position_error=kept["position_error"][whole].astype(float),
+        )
 
 
 def drive_vehicles(
@@ -96,33 +116,37 @@ def drive_vehicles(
     if not any(scenario.acting):
         raise CoopenvError("all motion here is prescribed or has a driver, there is nothing to drive")
     engine = Engine(scenario, worlds)
-    kept, ticks = Views(engine, KEPT), scenario.horizon_ticks
+    views, ticks = Views(engine, (*STEPS, "position_error")), scenario.horizon_ticks
     for tick in play(engine, seed, ticks, policy, False, stride=scenario.ticks_per_decision):
-        kept.take()
+        views.take()
         on_progress(tick / ticks)
         if tick == 0:
             there = engine.view("alive").copy()
     engine.close()
-    observations, actions, rewards, terminated, truncated, errors = (kept[name] for name in KEPT)
-    driven, ended, episodes = actions[1:], ((terminated + truncated) > 0)[1:], []
-    for world, vehicle in product(range(worlds), np.flatnonzero(scenario.acting)):
-        if not there[world, vehicle]:
-            continue
-        length = int(next(iter(np.flatnonzero(ended[:, world, vehicle])), len(driven) - 1)) + 1
-        before, after, whole = slice(length), slice(1, length + 1), slice(length + 1)
-        episodes.append(
-            DrivenEpisode(
-                world=world,
-                vehicle=scenario.vehicle_names[vehicle],
-                observations=observations[whole, world, vehicle],
-                actions=driven[before, world, vehicle],
-                rewards=rewards[after, world, vehicle].astype(float),
-                terminations=terminated[after, world, vehicle].astype(bool),
-                truncations=truncated[after, world, vehicle].astype(bool),
-                position_error=errors[whole, world, vehicle].astype(float),
-            )
-        )
+    kept, episodes = {name: views[name] for name in (*STEPS, "position_error")}, []
+    for world, i in product(range(worlds), np.flatnonzero(scenario.acting)):
+        if there[world, i]:
+            own = {name: array[:, world, i] for name, array in kept.items()}
+            episodes.append(DrivenEpisode.of(own, world, scenario.vehicle_names[i], own["actions"][1:]))
     return episodes
+
+
+def vehicle_episodes(episode: Episode) -> list[DrivenEpisode]:
+    """Return one per vehicle of an episode that has been recorded with `STEPS`; each tick counts as a decision.
+
+    The actions of a recording are not known; the measured velocities stand in their place.
+    """
+    L, kept = len(episode.scenario.landmarks), {name: episode[name] for name in (*STEPS, "position_error")}
+    actions = kept["actions"][1:]
+    if episode.source.seed is None:
+        twist = (episode.measured.velocity[1:], episode.measured.angular_velocity[1:])
+        actions = np.concatenate(twist, axis=-1)
+    there = episode.rows["present"][0][L:] != 0
+    return [
+        DrivenEpisode.of({name: array[:, i] for name, array in kept.items()}, 0, vehicle, actions[:, i])
+        for i, vehicle in enumerate(episode.scenario.vehicle_names)
+        if there[i]
+    ]
 
 
 FILES = ("main_data.hdf5", "metadata.json")
@@ -164,7 +188,7 @@ def write_dataset(
     """Write episodes as a dataset, which takes the place of an older one.
 
     Args:
-        episodes: in their order.
+        episodes: in their order, at least one.
         scenario: scenario of the episodes.
         spec: Gymnasium's, of the environment that readers recover; None: of none.
         place: the result of `dataset_place`.
@@ -174,6 +198,9 @@ def write_dataset(
     Raises:
         OutputError: it cannot be written.
     """
+    space = action_space(scenario)
+    if episodes[0].actions.shape[1:] != space.shape:
+        space = Box(-np.inf, np.inf, episodes[0].actions.shape[1:])
     size = sum(value.nbytes for episode in episodes for value in vars(episode).values() if hasattr(value, "nbytes"))
     needed = 2 * size + PER_EPISODE * len(episodes)
     with writing(place):  # HDF5 ends the process where the disk has no room (seen with h5py 3.16)
@@ -195,7 +222,7 @@ def write_dataset(
         buffers: list[Any] = [
             EpisodeBuffer(
                 id=number,
-                options={"world": episode.world, "vehicle": int(episode.vehicle.rpartition("_")[2])},
+                options={"world": episode.world, "vehicle": _number(episode.vehicle)},
                 infos={"position_error": episode.position_error},
                 **{name: getattr(episode, name) for name in arrays},
             )
@@ -208,9 +235,15 @@ def write_dataset(
             requirements=[f"coopenv=={version()}"],
             data_format="hdf5",
             observation_space=observation_space(observation_layout(scenario)),
-            action_space=action_space(scenario),
+            action_space=space,
             **facts,
         )
         for file in FILES:
             (new / identity / "data" / file).rename(new / file)
         shutil.rmtree(new / identity.split("/")[0])
+
+
+def _number(vehicle: str) -> int | str:
+    """Return 1 of `vehicle_1`, and a name without a number as it is."""
+    number = vehicle.rpartition("_")[2]
+    return int(number) if number.isdigit() else vehicle

@@ -1,6 +1,6 @@
 """Episodes recorded with what vehicles measure: the recordings of logs and of comparisons."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -42,9 +42,7 @@ def record(
     Raises:
         CoopenvError: unknown policy or observer, or the backend cannot begin.
     """
-    recording = record_episode(source, seed, policy, on_progress, on_tick).recording
-    assert recording is not None
-    return recording
+    return record_episode(source, seed, policy, on_progress, on_tick).measured
 
 
 def record_episode(
@@ -54,13 +52,18 @@ def record_episode(
     on_progress: Callable[[float], None] = lambda share: None,
     on_tick: Callable[[Engine, int], None] = lambda engine, tick: None,
     name: str = "",
+    more: Sequence[str] = (),
 ) -> Episode:
-    """Return the episode of a backend with its recording; arguments as of `record`, `name` stands in its heading."""
+    """Return the episode of a backend with its recording.
+
+    Arguments are those of `record`, and `name`, which stands in its heading, and fields of the engine that are recorded
+    beside the usual ones.
+    """
     backend = source if isinstance(source, Backend) else open_backend(source, None, {})
     scenario = backend.scenario
     driver = load_policy(policy, scenario, seed)
     engine = Engine(scenario, 1, "float64", backend=backend)
-    recorder = EpisodeRecorder(engine)
+    recorder = EpisodeRecorder(engine, more)
     ticks: list[Sensed] = []
     faults: list[Interference | None] = []
     drawn = None

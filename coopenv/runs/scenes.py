@@ -20,7 +20,7 @@ from coopenv.episode import SCENE_FILE, Episode, EpisodeRecorder, Origin
 from coopenv.evaluation.episodes import play
 from coopenv.observers import run
 from coopenv.observers.recording import Recording
-from coopenv.observers.registry import find, named, states_covariance, with_observer
+from coopenv.observers.registry import find, named, with_observer
 from coopenv.policies import Policy, agents_for, find_agent, load_policy
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.recorder import source_of
@@ -30,6 +30,7 @@ from coopenv.sources.mcap import log_views, write_recording
 from coopenv.sources.registry import kind_of
 from coopenv.sources.selection import WHOLE, Selection
 from coopenv.sources.sources import open_backend
+from coopenv.sources.worlds import scenario_of
 
 BASELINE = "route_follower"
 LOOKING = ("look_ahead", "peek")
@@ -218,7 +219,10 @@ def write_log(recording: Recording, path: Path, log: Console, observer: str | No
             result = run(name, recording)
         if result.failure:
             raise CoopenvError(f"observer {name} failed: {result.failure}; --no-scene writes the recording alone")
+        episode = Episode.of_run(
+            recording.scenario or scenario_of(recording, path.name, {}), path.name, recording, result, name
+        )
         for program in log_views().values():
-            shown += program.views(recording, result, start=start, gain=not states_covariance(name))
+            shown += program.views(episode, start=start)
     with Progress(log, f"writing {path.name}"):
         write_recording(recording, path, views=shown, start=start)

@@ -16,11 +16,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coopenv.cli.app import main
+from coopenv.episode import Episode
 from coopenv.estimation.poses import Coordinates, covariance_in_map
 from coopenv.observers import Run, run
 from coopenv.observers.recording import Recording
 from coopenv.scenario.sensing import Camera
 from coopenv.sources.mcap import read_recording, write_recording
+from coopenv.sources.worlds import scenario_of
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import differences, simulated
 
@@ -61,11 +63,16 @@ def xyz(point: Any) -> list[float]:
     return [point.x, point.y, point.z]
 
 
+def estimated(recording: Recording, result: Run, observer: str) -> Episode:
+    scenario = recording.scenario or scenario_of(recording, "log", {})
+    return Episode.of_run(scenario, "log", recording, result, observer)
+
+
 def written(recording: Recording, observer: str, path: Path) -> tuple[Run, Log]:
     from coopenv.foxglove.log_views import views
 
     result = run(observer, recording)
-    write_recording(recording, path, views=views(recording, result, start=START), start=START)
+    write_recording(recording, path, views=views(estimated(recording, result, observer), start=START), start=START)
     return result, Log(path)
 
 
@@ -251,7 +258,7 @@ def test_gain_matrices_are_no_covariances(tmp_path: Path) -> None:
     from coopenv.sources.mcap_format import codec
 
     made, path = simulated("crossing_path", horizon=22.0), tmp_path / "gain.mcap"
-    shown = views(made, run("riccati", made), gain=True)
+    shown = views(estimated(made, run("riccati", made), "riccati"))
     write_recording(made, path, views=shown)
     log = Log(path)
     assert "/scene/uncertainty" not in log.messages

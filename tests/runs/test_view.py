@@ -449,7 +449,7 @@ def test_a_kept_scene_is_shown_and_cannot_be_changed() -> None:
     with guarded_server("127.0.0.1") as (server, _):
         shown = Viewer(server, reel)
         wish(shown, ("seek", 1.0))
-        assert shown._frame.tick == record.fields["tick"][-1]
+        assert shown._frame.tick == record["tick"][-1]
     assert not reel.more()
     with pytest.raises(CoopenvError, match="nothing can be changed"):
         reel.change(observer="robust")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import json
-import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -28,6 +26,7 @@ from coopenv.viz.web import write_replay
 from coopenv.viz.web_panel import GAIN, table_html
 from coopenv.viz.web_picture import FIELD_OF_VIEW, first_camera, first_look, level_lines, levels, stopped
 from tests.helpers.env_suite import ALIKE, each_slow
+from tests.helpers.pages import messages
 
 ALONG = np.array([40.0, 0.0, 0.0])
 
@@ -190,19 +189,6 @@ def scene(name: str, **overrides: Any) -> Episode:
 @pytest.fixture(scope="module")
 def overtaking() -> Episode:
     return scene("overtaking", horizon=0.5)
-
-
-def messages(page: str) -> tuple[float, list[tuple[float, dict[str, Any]]]]:
-    """Return the length of the recording in a page, s, and its messages with their times."""
-    msgspec = pytest.importorskip("msgspec", reason="needs the extra view")
-    zstandard = pytest.importorskip("zstandard", reason="needs the extra view")
-    found = re.search(r'__VISER_EMBED_DATA__="([^"]+)"', page)
-    assert found
-    packed = base64.b64decode(found[1])
-    inner = zstandard.ZstdDecompressor().decompress(packed[8:], max_output_size=int.from_bytes(packed[:8], "little"))
-    length = int.from_bytes(inner[:8], "little")
-    content = msgspec.msgpack.decode(inner[8 : 8 + length])
-    return content["durationSeconds"], content["messages"]
 
 
 def test_names_of_vehicles_that_are_close_stand_above_each_other() -> None:
