@@ -22,10 +22,9 @@ from coopenv.base.format import fixed, jsonable, read_npz
 from coopenv.base.sections import Section, validated
 from coopenv.estimation import Sight
 from coopenv.estimation.observability import Trajectory
-from coopenv.estimation.poses import position_covariance, riccati_covariance
+from coopenv.estimation.poses import position_covariance
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import states_covariance
-from coopenv.observers.runner import Run
 from coopenv.scenario import Scenario, parse_scenario
 from coopenv.scenario.own_terms import without_own_terms
 
@@ -297,46 +296,6 @@ class Episode:
     def of_frames(cls, scenario: Scenario, source: Origin, frames: Sequence[Frame]) -> Self:
         """Return the episode of at least one frame."""
         return cls(scenario, source, {name: [getattr(frame, name) for frame in frames] for name in FIELDS})
-
-    @classmethod
-    def of_run(cls, scenario: Scenario, name: str, recording: Recording, run: Run, observer: str) -> Self:
-        """Return the episode of a recording with the estimates of an observer, by its name, that has run on it.
-
-        Nothing is known of rewards, goals, routes and other traffic; a target that is not measured is out of view.
-        """
-        r, K, N = recording, recording.ticks, len(recording.setups)
-        L = r.landmarks.shape[1]
-        neighbours = np.zeros((N, L + N), bool)
-        for setup in r.setups:
-            neighbours[setup.vehicle, setup.targets] = True
-        unseen = np.where(neighbours, Sight.OUT_OF_VIEW, Sight.NOT_A_NEIGHBOUR)
-        still, zeros = np.broadcast_to(np.eye(3), (K, L, 3, 3)), np.zeros((K, N))
-        arrays = {
-            "tick": np.arange(K),
-            "target_rotation": np.concatenate([still, r.truth.rotation], axis=1),
-            "target_position": np.concatenate([r.landmarks, r.truth.position], axis=1),
-            "rotation_estimate": run.rotation,
-            "position_estimate": run.position,
-            "covariance": riccati_covariance(run.coordinates, run.rotation, run.position, run.covariance),
-            "sight": np.where(r.visible, Sight.VISIBLE, unseen),
-            "pan": zeros if r.pan is None else r.pan,
-            "ended": zeros.astype(int),
-            "inbox_tick": r.inbox_tick,
-            "reward_terms": np.zeros((K, N, 0)),
-            "goal": np.full((K, N, 3), np.nan),
-            "route": np.zeros((K, N, 0, 3)),
-            "route_count": zeros.astype(int),
-            "route_drawn": zeros.astype(int) - 1,
-            "traffic_rotation": np.zeros((K, 0, 3, 3)),
-            **dict.fromkeys(("traffic_position", "traffic_half"), np.zeros((K, 0, 3))),
-            **{
-                name: getattr(run, name) for name in ("position_error", "orientation_error", "nees", "protection_level")
-            },
-        }
-        for name in ("velocity", "angular_velocity"):
-            arrays[name] = np.concatenate([np.zeros((K, L, 3)), getattr(r, name)], axis=1)
-        source = Origin(name=name, observer=observer, honest=states_covariance(observer))
-        return cls(scenario, source, arrays, recording)
 
     def save(self, path: Path) -> None:
         """Write the frames, `scene.npz`, in single precision.

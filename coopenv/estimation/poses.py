@@ -289,25 +289,23 @@ def position_covariance(rotation: Array, position: Array, covariance: Array) -> 
 
 
 def riccati_covariance(coordinates: Coordinates, rotation: Array, position: Array, covariance: Array) -> Array:
-    """Return covariances (..., 6, 6) in RICCATI coordinates, to first order.
+    """Return a covariance (6, 6) in RICCATI coordinates, to first order.
 
     With R = Rhat Exp(theta) and p = phat + Rhat rho (LEFT), R^T p = Rhat^T phat + rho + [Rhat^T phat]x theta + ...,
     and 2 lambda = theta + ...; a RIGHT error (theta, rho) turns both by Rhat^T.
 
     Args:
         coordinates: of the error that `covariance` is about.
-        rotation: Rhat (..., 3, 3), body to map.
-        position: phat (..., 3), map, m.
-        covariance: P (..., 6, 6).
+        rotation: Rhat (3, 3), body to map.
+        position: phat (3,), map, m.
+        covariance: P (6, 6).
     """
-    to_body = np.swapaxes(rotation, -1, -2)
     if coordinates is Coordinates.RICCATI:
         return covariance
     if coordinates is Coordinates.LEFT:
-        return _sheared(skew((to_body @ position[..., None])[..., 0]), covariance)
-    J = np.zeros(covariance.shape)
-    J[..., :3, :3], J[..., 3:, 3:] = to_body, to_body
-    return _symmetric(J @ covariance @ np.swapaxes(J, -1, -2))
+        return _sheared(skew(rotation.T @ position), covariance)
+    J = np.kron(np.eye(2), rotation.T)
+    return _symmetric(J @ covariance @ J.T)
 
 
 def left_covariance(position: Array, covariance: Array) -> Array:
@@ -317,13 +315,13 @@ def left_covariance(position: Array, covariance: Array) -> Array:
 
 def _sheared(S: Array, P: Array) -> Array:
     """Return T P T^T, T = [[I, 0], [S, I]], exactly symmetric."""
-    T = np.broadcast_to(np.eye(6), P.shape).copy()
-    T[..., 3:, :3] = S
-    return _symmetric(T @ P @ np.swapaxes(T, -1, -2))
+    T = np.eye(6)
+    T[3:, :3] = S
+    return _symmetric(T @ P @ T.T)
 
 
 def _symmetric(P: Array) -> Array:
-    return np.asarray((P + np.swapaxes(P, -1, -2)) / 2, dtype=np.float64)
+    return np.asarray((P + P.T) / 2, dtype=np.float64)
 
 
 Values = NDArray[Any]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
+from dataclasses import replace
 from importlib.util import find_spec
 from math import ceil
 from pathlib import Path
@@ -18,19 +19,18 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, list_envs
 from coopenv.episode import SCENE_FILE, Episode, EpisodeRecorder, Origin
 from coopenv.evaluation.episodes import play
-from coopenv.observers import run
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import find, named, with_observer
 from coopenv.policies import Policy, agents_for, find_agent, load_policy
 from coopenv.runs.console import Progress, compile_notice
-from coopenv.runs.recorder import source_of
+from coopenv.runs.recorder import record_episode, source_of
 from coopenv.scenario import Scenario
 from coopenv.sources.base import Backend
 from coopenv.sources.mcap import log_views, write_recording
 from coopenv.sources.registry import kind_of
 from coopenv.sources.selection import WHOLE, Selection
 from coopenv.sources.sources import open_backend
-from coopenv.sources.worlds import scenario_of
+from coopenv.sources.worlds import Replay
 
 BASELINE = "route_follower"
 LOOKING = ("look_ahead", "peek")
@@ -216,12 +216,11 @@ def write_log(recording: Recording, path: Path, log: Console, observer: str | No
     if scene:
         name = named(observer or observer_of(recording))
         with Progress(log, f"estimating with {name}"):
-            result = run(name, recording)
-        if result.failure:
-            raise CoopenvError(f"observer {name} failed: {result.failure}; --no-scene writes the recording alone")
-        episode = Episode.of_run(
-            recording.scenario or scenario_of(recording, path.name, {}), path.name, recording, result, name
-        )
+            try:
+                played = record_episode(Replay(recording, path.name, with_observer({}, name)))
+            except CoopenvError as error:
+                raise CoopenvError(f"{error}; --no-scene writes the recording alone") from None
+        episode = replace(played, recording=recording)
         for program in log_views().values():
             shown += program.views(episode, start=start)
     with Progress(log, f"writing {path.name}"):
