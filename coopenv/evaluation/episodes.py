@@ -19,7 +19,10 @@ DIVERGED = 1e9  # m or deg: stands for an error that is not a number
 
 @dataclass(frozen=True)
 class Episodes:
-    """Record of the driven vehicles; K decisions, W worlds, N driven vehicles. Row k is the end of decision k."""
+    """Record of the driven vehicles in many worlds, for the score of a driver, which has no single `Episode`.
+
+    K decisions, W worlds, N driven vehicles. Row k is the end of decision k.
+    """
 
     vehicles: tuple[str, ...]
     """(N,) names."""
