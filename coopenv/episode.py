@@ -6,7 +6,7 @@ tables and figures, the `Frame` of pictures, films and pages, and the `Recording
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from inspect import get_annotations
@@ -88,7 +88,7 @@ class Frame:
     @classmethod
     def of(cls, shown: FrameSource, world: int = 0) -> Self:
         """Return the present frame of a world of an engine."""
-        return cls.of_row(row_of(shown, world))
+        return cls.of_row(_in_map({name: np.array(shown.view(name)[world]) for name in RECORDED}))
 
     @classmethod
     def of_row(cls, row: Mapping[str, np.ndarray]) -> Self:
@@ -150,20 +150,23 @@ VIEWS = {
     "reward_terms": "terms",
 }
 """Arrays of an episode that have another name in an engine and in `scene.npz`."""
-_FURTHER = ("velocity", "angular_velocity", "covariance", "present")
-"""Arrays of an engine that no frame has: velocities and presence of all targets, P of the vehicles."""
+_NAMES = {view: name for name, view in VIEWS.items()}
+RECORDED = (
+    *(VIEWS.get(name, name) for name in FIELDS if name != "position_covariance"),
+    *("velocity", "angular_velocity", "covariance", "present"),
+)
+"""Fields of an engine that an episode is made of: of frames; of all targets velocities and presence; P of vehicles."""
 _SELDOM = frozenset(
     ("ended", "goal", "route", "route_count", "route_drawn", "traffic_half", "present", "inbox_tick", "pan")
 )
-"""Arrays that are mostly as at the tick before, which a record then holds once."""
+"""Fields that are mostly as at the tick before; a record then holds them once."""
 
 
-def row_of(shown: FrameSource, world: int = 0, more: Sequence[str] = ()) -> dict[str, np.ndarray]:
-    """Return a copy of the arrays of a world of an engine at the present tick, by their names in an episode."""
-    names = [*(FIELDS.keys() - {"position_covariance"}), *_FURTHER, *more]
-    row = {name: np.array(shown.view(VIEWS.get(name, name))[world]) for name in names}
-    row["position_estimate"] = (row["rotation_estimate"] @ row["position_estimate"][..., None])[..., 0]
-    return row
+def _in_map(row: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return fields of an engine by their names in an episode, the estimated positions in the map frame."""
+    named = {_NAMES.get(name, name): array for name, array in row.items()}
+    named["position_estimate"] = (named["rotation_estimate"] @ named["position_estimate"][..., None])[..., 0]
+    return named
 
 
 SCENE_FILE = "scene.npz"
@@ -215,7 +218,7 @@ class Episode:
     scenario: Scenario
     source: Origin
     rows: Mapping[str, Sequence[np.ndarray]]
-    """Array of each tick by its name: of a `Frame`, or of `_FURTHER`; a file holds those of its view."""
+    """Array of each tick by its name: of a `Frame`, and the others of `RECORDED`, which `scene.npz` does not hold."""
     recording: Recording | None = None
     """What the vehicles measured at the K ticks, where it has been recorded."""
 
@@ -340,26 +343,31 @@ class Episode:
         return cls(scenario, source, rows)
 
 
-class EpisodeRecorder:
-    """Takes the ticks of the first world of an engine; one whose copying was interrupted does not count."""
+class Views:
+    """Fields of an engine at several ticks; one whose copying was interrupted does not count."""
 
-    def __init__(self, shown: FrameSource, more: Sequence[str] = ()) -> None:
-        """Begin with no tick; `more` are fields of the engine that are recorded beside the usual ones."""
-        self._shown, self._more = shown, more
-        self._rows: dict[str, list[np.ndarray]] = {}
+    def __init__(self, shown: FrameSource, names: Iterable[str] = RECORDED) -> None:
+        """Begin with no tick; an episode needs those of `RECORDED`."""
+        self._shown = shown
+        self._rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
         self.taken = 0
         """Number of ticks."""
 
     def take(self) -> None:
-        """Copy the present tick."""
-        row = row_of(self._shown, more=self._more)
-        for name, array in row.items():
-            rows = self._rows.setdefault(name, [])
+        """Copy the fields as they are now."""
+        for name, rows in self._rows.items():
             del rows[self.taken :]
-            same = name in _SELDOM and self.taken and array.tobytes() == rows[-1].tobytes()
-            rows.append(rows[-1] if same else array)
+            row = self._shown.view(name).copy()
+            same = name in _SELDOM and rows and row.tobytes() == rows[-1].tobytes()
+            rows.append(rows[-1] if same else row)
         self.taken += 1
 
-    def episode(self, scenario: Scenario, source: Origin, recording: Recording | None = None) -> Episode:
-        """Return the episode so far, of at least one tick."""
-        return Episode(scenario, source, {name: rows[: self.taken] for name, rows in self._rows.items()}, recording)
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Return (K, W, ...) of one field."""
+        return np.stack(self._rows[name][: self.taken])
+
+    def episode(self, scenario: Scenario, source: Origin) -> Episode:
+        """Return the episode of the first world so far, of at least one tick."""
+        ticks = range(self.taken)
+        rows = [_in_map({name: fields[k][0] for name, fields in self._rows.items()}) for k in ticks]
+        return Episode(scenario, source, {name: [row[name] for row in rows] for name in rows[0]})

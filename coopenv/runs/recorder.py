@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.episode import Episode, EpisodeRecorder, Origin
+from coopenv.episode import RECORDED, Episode, Origin, Views
 from coopenv.evaluation.episodes import play
 from coopenv.observers.mailbox import Interference, interference_of, stacked
 from coopenv.observers.recording import MEASURED, Drawn, Recording, Sensed, Truth, is_due
@@ -63,12 +63,12 @@ def record_episode(
     scenario = backend.scenario
     driver = load_policy(policy, scenario, seed)
     engine = Engine(scenario, 1, "float64", backend=backend)
-    recorder = EpisodeRecorder(engine, more)
+    views = Views(engine, (*RECORDED, *more))
     ticks: list[Sensed] = []
     faults: list[Interference | None] = []
     drawn = None
     for k in play(engine, [seed], scenario.horizon_ticks, driver if scenario.driven else None):
-        recorder.take()
+        views.take()
         if k == 0 and backend.capabilities.batched:
             key, number, parameters = (engine.view(name)[0].tolist() for name in ("seed", "episode", "parameter"))
             drawn = Drawn(key, number, tuple(parameters))
@@ -79,7 +79,7 @@ def record_episode(
     L, observer_init = len(scenario.landmarks), engine.world.observer_init
     names = MEASURED if scenario.action.pan is None else (*MEASURED, "pan")
     kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in names}
-    episode = recorder.episode(scenario, source_of(engine, name, seed, policy if isinstance(policy, str) else "custom"))
+    episode = views.episode(scenario, source_of(engine, name, seed, policy if isinstance(policy, str) else "custom"))
     recording = Recording(
         setups=observer_init.setups,
         order=observer_init.order,

@@ -13,7 +13,7 @@ from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError, explained
 from coopenv.base.installation import version
-from coopenv.episode import Episode, EpisodeRecorder
+from coopenv.episode import Episode, Views
 from coopenv.estimation import Outcome
 from coopenv.estimation.metrics import CONVERGED, mean_targets_in_view, observability_of, steady_mean, summarise
 from coopenv.estimation.observability import ConvergenceRates, Observability, Trajectory, convergence_rates, least_mean
@@ -63,7 +63,7 @@ class Rollout:
             self.ticks_planned = min(self.ticks_planned, steps * scenario.ticks_per_decision)
         self.wall_time = 0.0
         self._options = options
-        self._recorder = EpisodeRecorder(self.engine)
+        self._views = Views(self.engine)
 
     @property
     def vehicles(self) -> tuple[int, ...]:
@@ -73,7 +73,7 @@ class Rollout:
     @property
     def ticks_recorded(self) -> int:
         """Camera ticks since t = 0 that have been recorded."""
-        return max(0, self._recorder.taken - 1)
+        return max(0, self._views.taken - 1)
 
     def play(self) -> Iterator[int]:
         """Start the episode and yield the number of each camera tick, from 0, once it is recorded.
@@ -86,11 +86,11 @@ class Rollout:
             CoopenvError: an estimate is not finite.
         """
         start = perf_counter()
-        self._recorder = EpisodeRecorder(self.engine)
+        self._views = Views(self.engine)
         self.wall_time = 0.0
         moments = play(self.engine, [self.seed], self.ticks_planned, self.policy, False, self._options)
         for tick in moments:
-            self._recorder.take()
+            self._views.take()
             self._check_estimates(tick)
             self.wall_time += perf_counter() - start
             yield tick
@@ -108,7 +108,7 @@ class Rollout:
 
     def episode(self, name: str = "") -> Episode:
         """Return the record so far, of what has a name; `play` must have yielded at least once."""
-        return self._recorder.episode(self.scenario, source_of(self.engine, name, self.seed, self.policy_name))
+        return self._views.episode(self.scenario, source_of(self.engine, name, self.seed, self.policy_name))
 
     def trajectory(self) -> Trajectory:
         """Return the trajectories so far; `play` must have yielded at least once."""

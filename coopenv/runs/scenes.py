@@ -17,7 +17,7 @@ from rich.console import Console
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, list_envs
-from coopenv.episode import SCENE_FILE, Episode, EpisodeRecorder, Origin
+from coopenv.episode import SCENE_FILE, Episode, Origin, Views
 from coopenv.evaluation.episodes import play
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import find, named, with_observer
@@ -63,16 +63,16 @@ def scene_of(
     Raises:
         CoopenvError: the policy fails, or the backend cannot begin.
     """
-    recorder, scenario = EpisodeRecorder(engine), engine.backend.scenario
+    views, scenario = Views(engine), engine.backend.scenario
     ticks, stride = int(min(scenario.horizon_ticks, longest * scenario.rates.camera)), frame_stride(scenario)
     tick = 0
     for tick in play(engine, [source.seed or 0], ticks, policy, to_the_end=False):
         if tick % stride == 0:
-            recorder.take()
+            views.take()
             on_progress(tick / ticks)
     if tick % stride:
-        recorder.take()
-    return recorder.episode(scenario, source)
+        views.take()
+    return views.episode(scenario, source)
 
 
 def played_scene(
