@@ -1,6 +1,7 @@
 """Texts with a unit, and plausible ranges of quantities."""
 
 import math
+import re
 from typing import Annotated, Any
 
 import pytest
@@ -71,6 +72,13 @@ def test_bounds_hold_for_the_converted_number() -> None:
     with pytest.raises(CoopenvError, match=r"side: Input should be greater than 0, got -0.06"):
         validated(Parts, {"side": "-60 mm"}, "parts")
     assert validated(Parts, '{"places": [["1 km", 2]], "named": {"x": "20 ms"}}', "parts").places == ((1000.0, 2.0),)
+
+
+@pytest.mark.parametrize("given", [10**400, -(10**400), "1e400 m"])
+def test_a_number_beyond_the_largest_float_is_refused_in_one_line(given: object) -> None:
+    likely = re.escape(UNITS["m"][0])
+    with pytest.raises(CoopenvError, match=rf"^parts: side: Input should be a .* number, got .*: {likely}$"):
+        validated(Parts, {"side": given}, "parts")
 
 
 def test_every_implausible_key_is_named_once_with_value_unit_and_likely_mistake() -> None:

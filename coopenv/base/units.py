@@ -51,16 +51,19 @@ class Unit:
         try:
             return checked(number)
         except ValidationError as error:
-            if type(number) not in (int, float) or not self.doubt(number):
+            if type(number) not in (int, float) or self._plausible(number):
                 raise
             raise ValueError(f"{error.errors()[0]['msg']}, got {shown(given)}: {likely}") from None
 
     def doubt(self, value: float, factor: float = 1.0) -> str:
         """Return why a number is implausible, and the likely mistake, or nothing; `factor` widens the range."""
-        if value == 0.0 or self.least <= abs(value) <= self.most * factor:
+        if self._plausible(value, factor):
             return ""
         expected = f"{self.least:g} to {self.most * factor:.5g}"
         return f"{value:.6g} {self.symbol} is implausible (expected magnitude {expected}): {UNITS[self.symbol][0]}"
+
+    def _plausible(self, value: float, factor: float = 1.0) -> bool:
+        return value == 0.0 or self.least <= abs(value) <= self.most * factor
 
     def holds_for(self, numbers: tuple[Any, ...]) -> bool:
         """Return whether a tuple consists of plausible numbers."""

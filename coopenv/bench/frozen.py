@@ -174,15 +174,17 @@ class Frozen:
         for row in self.zoo["rows"]:
             least[row["scene"]] = min(row["rmse_m"], least.get(row["scene"], math.inf))
         refused = {}
-        for observer in {row["observer"] for row in rows} - zoo().keys():
+        for observer in sorted({row["observer"] for row in rows} - zoo().keys()):
             own = [row for row in rows if row["observer"] == observer and not row["failure"]]
-            if (anees := median_of(row["anees_median"] for row in own)) is not None and anees < LEAST_ANEES:
+            if (anees := median_of(row["anees_median"] for row in own)) < LEAST_ANEES:  # NaN: none is stated
                 why = f"ANEES {anees:.2g} is below {LEAST_ANEES:g}: state a smaller covariance, or none"
                 refused[observer] = f"{observer} refused: {why}"
             for row in own:
-                if row["rmse_m"] < (limit := LEAST_SHARE * min(row["bound_m"], least.get(row["scene"], math.inf))):
+                limits = {"the bound": row["bound_m"], "the best shipped row": least.get(row["scene"], math.inf)}
+                what = min(limits, key=lambda name: limits[name])
+                if row["rmse_m"] < (limit := LEAST_SHARE * limits[what]):
                     why = f"{row['rmse_m']:.2g} m in {row['scene']} is below {limit:.2g} m"
-                    refused[observer] = f"{observer} refused: {why}, {LEAST_SHARE:g} of the bound"
+                    refused[observer] = f"{observer} refused: {why}, {LEAST_SHARE:g} of {what}"
         return refused
 
     def _remarks(self, found: Mapping[str, Any], limits: ProcessLimits) -> list[str]:

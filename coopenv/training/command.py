@@ -27,7 +27,8 @@ from coopenv.base.errors import CoopenvError, OutputError, evaluation_seed
 from coopenv.base.files import check_file, new_folder, replacing_file, replacing_folder, writing
 from coopenv.evaluation import Result, drive, held_out_seeds, ranking_key, score
 from coopenv.policies import Policy, load_agent
-from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE
+from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE, check_agent
+from coopenv.policies.network import RightOfWay
 from coopenv.scenario import Scenario
 from coopenv.sources.sources import open_simulation
 from coopenv.training.export import EXPORTED, check_onnx, export
@@ -96,14 +97,21 @@ def possible(plan: TrainingPlan) -> Scenario:
     """Return the scenario of a training, before anything is made.
 
     Raises:
-        CoopenvError: no vehicle is driven there, a variation is not possible, or the driver to begin as lacks what it
-            needs to see.
+        CoopenvError: no vehicle is driven there, a variation is not possible, a driver of the ranking is unknown, or
+            the driver to begin as, or the right of way, lacks what it needs to see.
     """
     scenario = open_simulation(plan.environment, plan.all_overrides)
     if not any(scenario.acting):
         raise CoopenvError(f"{plan.environment}: all motion is prescribed or has a driver, there is nothing to learn")
     if plan.settings.start is not None:
         tensors_of(plan.settings.start, scenario)
+    for name in plan.settings.evaluation.drivers:
+        check_agent(name, "driver (evaluation.drivers)")
+    if plan.settings.right_of_way:
+        try:
+            RightOfWay(scenario)
+        except ValueError as error:
+            raise CoopenvError(f"right_of_way: {error}") from None
     for own in plan.watched():
         try:
             for each, _ in own.scenarios():
@@ -223,12 +231,14 @@ def _notes(trainer: Trainer, course: Course) -> Iterator[str]:
 def _judge_drivers(plan: TrainingPlan, scenario: Scenario, course: Course, report: Reports, judge: Judge) -> None:
     """Judge the drivers that the policy is ranked among, as far as they can drive."""
     seeds = held_out_seeds(0, plan.settings.evaluation.final_worlds)
-    cloned = [plan.settings.clone.agent] if plan.settings.clone else []
+    cloned, able = [plan.settings.clone.agent] if plan.settings.clone else [], list[tuple[str, Policy]]()
     for name in dict.fromkeys((*cloned, *plan.settings.evaluation.drivers)):
         with suppress(CoopenvError):
             policy = load_agent(name, scenario)
-            report.cloning(f"judging {name}")
-            course.drivers[name] = figures_of(judge(policy, name, seeds))
+            able.append((name, policy))
+    for name, policy in able:
+        report.cloning(f"judging {name}")
+        course.drivers[name] = figures_of(judge(policy, name, seeds))
 
 
 def _learn(trainer: Trainer, course: Course, report: Reports, judge: Judge, keep: Callable[[], None]) -> None:

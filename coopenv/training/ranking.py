@@ -51,7 +51,7 @@ class Ranking:
         """The ranking, and what is missing, on one line."""
         drivers = ", ".join(
             f"{name} ({100 * self.drivers[name]['arrival_rate']:.3g} % arrive, e95 "
-            f"{100 * self.drivers[name]['e95_m']:.2g} cm)"
+            f"{100 * self.drivers[name]['e95_m']:.3g} cm)"
             for name in self.order
         )
         place = f"Rank {1 + self.order.index(self.own)} of {len(self.drivers)} in held-out worlds: {drivers}"

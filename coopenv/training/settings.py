@@ -28,6 +28,7 @@ from coopenv.base.installation import (
 )
 from coopenv.base.sections import NonNegative, Positive, Probability, Section, read_toml, toml_of, validated
 from coopenv.policies.loader import AGENT_FILE, load_agent
+from coopenv.policies.network import RightOfWay
 from coopenv.scenario import Scenario
 from coopenv.scenario.cosimulators import FILES
 from coopenv.scenario.files import merged
@@ -256,7 +257,7 @@ def usual_settings(environment: str, overrides: Mapping[str, Any], **changes: An
 
     They are those of the agents that ship with coopenv, where the driver that these begin as can drive; in other
     environments without their reward, and without variations that are not possible. Several vehicles keep the right of
-    way by the rule.
+    way by the rule, where it sees what it needs.
     """
     name, changed = Path(environment).stem, {key: value for key, value in changes.items() if value is not None}
     shipped = read_settings(data_directory("agents") / SETTINGS_FILE, USUAL_ARM, name)
@@ -271,8 +272,11 @@ def usual_settings(environment: str, overrides: Mapping[str, Any], **changes: An
         return read_settings(None, None, name, **changes)
     often = min(settings.evaluation.every, max(1, settings.steps // LOOKS))
     evaluation = settings.evaluation.model_copy(update={"every": often})
-    usual = {"evaluation": evaluation, "right_of_way": len(scenario.vehicles) > 1}
-    settings = settings.model_copy(update=usual)
+    settings = settings.model_copy(update={"evaluation": evaluation})
+    if len(scenario.vehicles) > 1:
+        with suppress(ValueError):  # the observation lacks what the rule needs
+            RightOfWay(scenario)
+            settings = settings.model_copy(update={"right_of_way": True})
     fitting = []
     for own in settings.variations:
         with suppress(CoopenvError):

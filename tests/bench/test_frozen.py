@@ -146,6 +146,9 @@ def test_rows_that_measurements_do_not_make_possible_are_refused() -> None:
     assert benchmark.refused([possible, row("ring", 1e-9, bound_m=0.05)]) == {
         "mine": "mine refused: 1e-09 m in ring is below 0.045 m, 0.9 of the bound"
     }
+    best = min(row["rmse_m"] for row in benchmark.zoo["rows"] if row["scene"] == "ring")
+    [line] = benchmark.refused([row("ring", 1e-9, bound_m=2.0 * best)]).values()
+    assert line.endswith(f"is below {0.9 * best:.2g} m, 0.9 of the best shipped row")
     assert benchmark.refused([{**possible, "anees_median": 0.01}]) == {
         "mine": "mine refused: ANEES 0.01 is below 0.16: state a smaller covariance, or none"
     }

@@ -41,3 +41,7 @@ def test_the_last_line_names_what_is_missing(own: dict[str, float], missing: lis
 
 def test_the_first_of_drivers_that_crash_lacks_arrivals() -> None:
     assert Ranking("mine", {"peek": EXACT, "mine": driver(0.9, 0.0, 0.1)}).missing == ["90 % arrive, 98 % should"]
+
+
+def test_the_error_of_a_lost_driver_is_a_plain_number() -> None:
+    assert "mine (0 % arrive, e95 100 cm)" in Ranking("mine", {"peek": SAFE, "mine": driver(0.0, 1.0, 1.0)}).line

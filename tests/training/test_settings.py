@@ -69,6 +69,8 @@ def test_a_training_of_which_nothing_is_said_begins_as_the_planner_where_that_ca
     assert (capped.minutes, capped.steps) == (2.0, shipped.steps), "minutes stop a training, and do not plan it"
     further = usual_settings("open_square", {}, start="my_driver", steps=80)
     assert (further.start, further.clone, further.evaluation.every) == ("my_driver", None, 10)
+    blind = usual_settings("open_square", {"observation.exclude": ["map_position"]}, start="my_driver")
+    assert not blind.right_of_way, "the rule needs the map"
     assert usual_settings("open_square", {"observation.exclude": ["map"]}) == read_settings(None)
     assert usual_settings("large_crossing", {}).scenario == {}, "its reward is its own"
 

@@ -288,11 +288,16 @@ def test_an_environment_that_changed_since(here: Path, capsys: pytest.CaptureFix
         ),
         (["train", "urban_crossing", "--agent", "route_follower", "--settings", "train.toml"], "give one of them"),
         (["train", "urban_crossing", "--arm", "x"], "no arm 'x'; known: none"),
+        (
+            ["train", "facade", "--settings", "rule.toml", "--override", "observation.include=['estimate']"],
+            "right_of_way: the observation lacks axis_std",
+        ),
     ],
 )
 def test_mistakes_are_one_line(
     arguments: list[str], message: str, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (here / "rule.toml").write_text("right_of_way = true")
     assert main(arguments) == 2
     error_text = capsys.readouterr().err
     assert message in error_text and error_text.count("\n") == 1
@@ -306,6 +311,7 @@ def test_mistakes_are_one_line(
         (1, "a_file/logs", "", "cannot write to a_file/logs: "),
         (1, None, "vehicles = 100_000_000", "would need"),
         (1, None, "[clone]\nagent = 'nobody'", "unknown agent 'nobody'"),
+        (1, None, "[evaluation]\ndrivers = ['pek']", "unknown driver .* 'pek' .did you mean 'peek'"),
     ],
 )
 def test_a_training_that_cannot_begin_leaves_nothing(

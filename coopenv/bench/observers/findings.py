@@ -16,7 +16,8 @@ from coopenv.observers.recording import PER_TICK, Recording, Truth
 from coopenv.observers.registry import find
 from coopenv.observers.runner import Run, run
 
-STRETCH, CHANGE = 1.5, 0.5  # s: the length of the changed records, and the time of their change
+STRETCH, CHANGE = 1.5, 0.5  # s: the length of the changed records, and the latest time of their change
+BEFORE = 4  # usable frames before the change: a gate lets much of the first ones pass
 EQUAL = 0.03  # relative, of errors in turned axes; those of `ukf` change by 0.016, as its sigma points follow the axes
 SMALL = 4.0  # ANEES of a standard deviation that is half the error
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # a right angle about the vertical axis
@@ -25,25 +26,30 @@ QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # a ri
 def findings_on(observer: str | Factory, recording: Recording, result: Run, steady_from: float) -> tuple[str, ...]:
     """Return the mistakes of an observer that ran on a record with this result, steady from a time on, s.
 
-    Joint observers, failed runs and records with faults of messages or observers are not examined.
+    Joint observers and failed runs are not examined, and neither are records with few frames until the change, or with
+    faults of messages or observers.
     """
     if recording.interference is not None or result.failure or getattr(find(observer), "joint", False):
         return ()
     record = _start(recording)
+    usable = record.visible & record.due[:, None, None]
+    usable[..., record.landmarks.shape[1] :] &= record.inbox_tick >= 0
+    frames = np.flatnonzero(usable.any(axis=(1, 2)) & (record.t <= CHANGE))
+    if len(frames) <= BEFORE:
+        return ()
+    tick = int(frames[-1])
     errors = ("position_error", "orientation_error", "nees")
     turned = run(observer, _turned(record))
     before, after = (
         [np.nansum(getattr(one, name)[: record.ticks], axis=0) for name in errors] for one in (result, turned)
     )
     found = [] if turned.failure or np.allclose(before, after, rtol=EQUAL, atol=1e-6) else ["wrong frame"]
-    tick = int(np.flatnonzero(record.due & (record.t <= CHANGE))[-1])
     bearings, inbox = record.bearings.copy(), record.inbox_tick.copy()
     bearings[tick], inbox[tick:] = bearings[tick] @ QUARTER.T, inbox[tick]
-    measured = record.visible & record.due[:, None, None]
-    newer = (record.inbox_tick > inbox) & measured[..., record.landmarks.shape[1] :]
-    measured[:tick], delay = False, 0
+    newer = (record.inbox_tick > inbox) & usable[..., record.landmarks.shape[1] :]
+    delay, usable[:tick], usable[tick + 1 :] = 0, False, False
     for name, made, effective in (
-        ("bearings", replace(record, bearings=bearings), measured),
+        ("bearings", replace(record, bearings=bearings), usable),
         ("messages", replace(record, inbox_tick=inbox), newer),
     ):
         answer = run(observer, made)

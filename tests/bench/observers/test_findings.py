@@ -81,6 +81,23 @@ def test_observers_without_a_mistake_have_no_finding(scene: str, observer: Any) 
     assert findings_on(observer, made, run(observer, made), 1.4) == ()
 
 
+@pytest.mark.parametrize("rate", [1.0, 0.25])
+def test_a_record_of_a_slow_camera_is_not_examined(rate: float) -> None:
+    """It has no frame until the change."""
+    rates = {f"rates.{name}": rate for name in ("camera", "odometry", "decision")}
+    made = record(load_scenario("busy_intersection_tracking", {"horizon": 2.0 / rate, **rates}), 1)
+    assert findings_on("riccati", made, run("riccati", made), 0.0) == ()
+
+
+def test_a_frame_without_measurements_is_not_the_one_that_is_changed(crossing: Recording) -> None:
+    hidden = (crossing.t > 0.35) & (crossing.t < 0.6)
+    visible = crossing.visible & ~hidden[:, None, None]
+    made = replace(crossing, visible=visible, bearings=np.where(visible[..., None], crossing.bearings, np.nan))
+    ungated = changed(UNGATED)
+    assert findings_on(changed(), made, run(changed(), made), 1.4) == ()
+    assert findings_on(ungated, made, run(ungated, made), 1.4) == ("no gate",)
+
+
 def test_the_zoo_has_the_findings_that_its_page_states(crossing: Recording) -> None:
     named = {"dead_reckoning": ("bearings ignored", "messages ignored"), "hamel_samson": ("messages ignored",)}
     named |= {"mekf_covariance_ungated": ("no gate",), "riccati": ("no gate",), "ukf": (), "centralised": ()}
