@@ -272,33 +272,29 @@ class Episode:
         """The arrays that tables and figures are about; NaN where the file of the episode does not have one."""
         s, L = self.scenario, len(self.scenario.landmarks)
         moving = [landmark.motion.kind != "static" for landmark in s.landmarks]
-        sight, pose = self["sight"], {name: self[name] for name in ("target_position", "target_rotation")}
-        unknown = np.full((len(self), len(s.vehicles), 6, 6), np.nan)
-        twist = {
-            name: self[name][:, L:] if name in self.rows else unknown[..., :3, 0]
-            for name in ("velocity", "angular_velocity")
-        }
+        sight, target_position = self["sight"], self["target_position"]
+        if "covariance" in self.rows:
+            P, velocity, turn = self["covariance"], self["velocity"][:, L:], self["angular_velocity"][:, L:]
+        else:
+            P = np.full((len(self), len(s.vehicles), 6, 6), np.nan)
+            velocity = turn = P[..., :3, 0]
         same = ("position_estimate", "rotation_estimate", "position_error", "orientation_error", "nees")
         return Trajectory(
             t=self.time,
-            position=pose["target_position"][:, L:],
-            rotation=pose["target_rotation"][:, L:],
-            target_position=pose["target_position"],
+            position=target_position[:, L:],
+            rotation=self["target_rotation"][:, L:],
+            target_position=target_position,
             visible=sight == Sight.VISIBLE,
             sight=sight,
-            covariance=self["covariance"] if "covariance" in self.rows else unknown,
+            covariance=P,
+            velocity=velocity,
+            angular_velocity=turn,
             vehicles=np.array(s.vehicle_names),
             targets=np.array(s.target_names),
             target_moving=np.array([*moving, *(True for _ in s.vehicles)]),
             terms=np.array(self.source.terms, dtype=str),
-            **twist,
             **{name: self[name] for name in (*same, "protection_level", "reward_terms")},
         )
-
-    @classmethod
-    def of_frames(cls, scenario: Scenario, source: Origin, frames: Sequence[Frame]) -> Self:
-        """Return the episode of at least one frame."""
-        return cls(scenario, source, {name: [getattr(frame, name) for frame in frames] for name in FIELDS})
 
     def save(self, path: Path) -> None:
         """Write the frames, `scene.npz`, in single precision.

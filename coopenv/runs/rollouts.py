@@ -116,7 +116,7 @@ class Rollout:
 
     def endings(self, vehicles: Sequence[int] | None = None) -> list[Ending]:
         """Return the end of each vehicle's run so far (None: of the vehicles that are estimated here)."""
-        ended = self.episode()["ended"][:, [*(self.vehicles if vehicles is None else vehicles)]]
+        ended = self._views["ended"][:, 0][:, [*(self.vehicles if vehicles is None else vehicles)]]
         first = np.where(ended.any(axis=0), np.argmax(ended != 0, axis=0), len(ended) - 1)
         words, times = outcome_words(self.scenario), (first / self.scenario.rates.camera).tolist()
         return [Ending(words[outcome], time) for outcome, time in zip(ended[-1].tolist(), times, strict=True)]

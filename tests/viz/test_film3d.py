@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
-from coopenv.episode import Episode, Frame, Origin
+from coopenv.episode import FIELDS, Episode, Frame, Origin
 from coopenv.estimation import Sight
 from coopenv.runs.films import cause_of_loss
 from coopenv.viz.perspective import Lens
@@ -135,6 +135,10 @@ def test_the_pair_camera_shows_both_cars_with_the_line_of_sight_between_them() -
     assert changed[row - 9 : row + 10, column - 9 : column + 10].max() > 60.0
 
 
+def rows_of(frame: Frame) -> dict[str, list[np.ndarray]]:
+    return {name: [getattr(frame, name)] for name in FIELDS}
+
+
 def test_a_heading_names_the_cause_of_a_loss(frame: Frame) -> None:
     """Metres of error are the drivers' fault where the covariance states them, and else the observer's."""
     scenario, stage = coopenv.load_scenario("urban_crossing"), Stage(coopenv.load_scenario("urban_crossing"))
@@ -142,13 +146,13 @@ def test_a_heading_names_the_cause_of_a_loss(frame: Frame) -> None:
 
     def cause(covariance: float, **source: object) -> str:
         stated = replace(far, position_covariance=covariance * np.tile(np.eye(3), (4, 1, 1)))
-        record = Episode.of_frames(scenario, Origin.of("urban_crossing", scenario, **source), [stated])
+        record = Episode(scenario, Origin.of("urban_crossing", scenario, **source), rows_of(stated))
         return cause_of_loss(record, stage, stated)
 
     assert cause(4.0, policy="peek") == "the drivers see too little"
     assert cause(4.0) == "stated as uncertain"
     assert cause(1.0, policy="peek") == "the observer is wrong"
-    record = Episode.of_frames(scenario, Origin.of("urban_crossing", scenario), [frame])
+    record = Episode(scenario, Origin.of("urban_crossing", scenario), rows_of(frame))
     assert cause_of_loss(record, stage, frame) == "initial estimates"
 
 
