@@ -22,8 +22,8 @@ from rich.console import Console
 
 import coopenv
 from benchmarks.options import at_least, status_of
-from coopenv.base.errors import EVALUATION_SEEDS
 from coopenv.base.format import in_parentheses
+from coopenv.base.seeds import EVALUATION_SEEDS
 from coopenv.bench.observers.changes import DIRECTION
 from coopenv.bench.observers.rows import standard_error
 from coopenv.bench.pages import table

@@ -27,10 +27,11 @@ from benchmarks.machine import machine
 from benchmarks.options import at_least
 from coopenv import EVALUATION_SEEDS, load_scenario
 from coopenv.api.engine import Engine
-from coopenv.base.errors import CoopenvError, ScenarioWarning, check_one_of, world_keys
+from coopenv.base.errors import CoopenvError, ScenarioWarning, check_one_of
 from coopenv.base.files import replace_text
 from coopenv.base.format import in_parentheses, json_text
 from coopenv.base.installation import version
+from coopenv.base.seeds import world_keys
 from coopenv.bench.pages import fingerprint
 from coopenv.observers.registry import find_embedded, list_observers
 from coopenv.runs.console import Progress

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 from coopenv.base import lazy_names
 from coopenv.base.errors import (
-    EVALUATION_SEEDS,
     ActionError,
     CoopenvError,
     DataError,
@@ -22,9 +21,9 @@ from coopenv.base.errors import (
     OutputError,
     ScenarioError,
     UnknownEnvironmentError,
-    evaluation_seed,
 )
 from coopenv.base.installation import list_agents, list_envs, sample_bags
+from coopenv.base.seeds import EVALUATION_SEEDS, evaluation_seed
 
 if TYPE_CHECKING:
     from coopenv.api.make import make_vec, parallel_env

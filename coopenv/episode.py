@@ -21,8 +21,8 @@ from coopenv.base.files import replacing_file
 from coopenv.base.format import fixed, jsonable, read_npz
 from coopenv.base.sections import Section, validated
 from coopenv.estimation import Sight
-from coopenv.estimation.observability import Trajectory
 from coopenv.estimation.poses import position_covariance
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario, parse_scenario

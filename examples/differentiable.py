@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.base.errors import ActionError, ScenarioError, ScenarioWarning, world_keys
+from coopenv.base.errors import ActionError, ScenarioError, ScenarioWarning
+from coopenv.base.seeds import world_keys
 from coopenv.estimation.linalg import block3, cholesky6, exp_so3, increment, join6, orthonormalise
 from coopenv.observers.riccati import accumulate_information, correct_kalman, predict_covariance, predict_pose
 from coopenv.scenario import Scenario

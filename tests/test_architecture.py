@@ -19,6 +19,7 @@ ROOMS = (
     ("sources", "backends"),
     ("episode",),
     ("viz",),
+    ("policies.base",),
     ("api",),
     ("policies",),
     ("evaluation",),

@@ -17,9 +17,9 @@ from coopenv.base.installation import environment_id, list_agents
 from coopenv.bench.observers.faults import FAULTS, VARIANTS
 from coopenv.cli.app import failure_status, main
 from coopenv.cli.options import parse_value
-from coopenv.estimation.observability import Trajectory
-from coopenv.observers.recording import Truth
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.observers.registry import list_observers
+from coopenv.observers.sensed import Truth
 from coopenv.runs import console
 from coopenv.runs.command import Results
 from coopenv.runs.recorder import record

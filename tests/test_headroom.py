@@ -19,7 +19,7 @@ from coopenv.evaluation import Difference, Episodes, compare_paired, drive, held
 from coopenv.evaluation.metrics import scored_errors
 from coopenv.policies import load_agent
 from coopenv.scenario import load_scenario
-from coopenv.scenario.learning import Difficulty
+from coopenv.scenario.difficulty import Difficulty
 from tests.helpers.env_suite import LARGEST, rest_slow
 
 pytestmark = pytest.mark.headroom

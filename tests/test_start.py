@@ -16,11 +16,11 @@ import coopenv
 import coopenv.observers
 import coopenv.runs
 from coopenv.base.errors import escaped, printable
-from coopenv.cli import options
+from coopenv.cli import arguments
 from tests.helpers.four_way import FOUR_WAY
 
 HEAVY = {"warp", "scipy", "numba", "matplotlib", "PIL", "pandas", "mcap", "torch", "joblib", "jinja2"}
-LIGHT = {f"base.{name}" for name in ("errors", "installation", "interrupts", "plugins")}
+LIGHT = {f"base.{name}" for name in ("errors", "installation", "interrupts", "plugins", "seeds")}
 LIGHT |= {"base", "api", "api.registration"}
 PACKAGE = Path(coopenv.__file__).parent
 LIGHT |= {"cli", *(f"cli.{path.stem}" for path in (PACKAGE / "cli").glob("[a-z]*.py"))}
@@ -174,29 +174,29 @@ def test_every_public_name_is_found_and_listed(package: ModuleType) -> None:
 
 
 def test_the_shell_completes_without_the_simulation() -> None:
-    loaded = modules_after("from coopenv.cli.options import *; environments(''), agents(''), policies('')")
+    loaded = modules_after("from coopenv.cli.arguments import *; environments(''), agents(''), policies('')")
     assert not {name for name in loaded if name.startswith("coopenv.")} - {f"coopenv.{name}" for name in LIGHT}
-    assert not HEAVY & modules_after("from coopenv.cli.options import *; observers('')")
-    assert not HEAVY & modules_after("from coopenv.cli.options import *; override_keys('')")
+    assert not HEAVY & modules_after("from coopenv.cli.arguments import *; observers('')")
+    assert not HEAVY & modules_after("from coopenv.cli.arguments import *; override_keys('')")
 
 
 def test_completions() -> None:
-    assert options.environments("busy") == [name for name in coopenv.list_envs() if name.startswith("busy")]
-    assert options.agents("route") == ["route_follower"]
-    assert options.agent_lists("mine.py:Mine,route") == ["mine.py:Mine,route_follower"]
-    assert options.policies("") == ["zero", "random", *options.agents("")]
-    assert options.observers("riccati,mek") == [
+    assert arguments.environments("busy") == [name for name in coopenv.list_envs() if name.startswith("busy")]
+    assert arguments.agents("route") == ["route_follower"]
+    assert arguments.agent_lists("mine.py:Mine,route") == ["mine.py:Mine,route_follower"]
+    assert arguments.policies("") == ["zero", "random", *arguments.agents("")]
+    assert arguments.observers("riccati,mek") == [
         "riccati,mekf",
         "riccati,mekf_covariance",
         "riccati,mekf_covariance_ungated",
     ]
-    assert "mekf" not in options.observers("mekf,me")
-    assert options.override_keys("noise.e") == ["noise.enabled="]
-    assert options.override_keys("vehicles.*.goal") == ["vehicles.*.goal.position=", "vehicles.*.goal.radius="]
+    assert "mekf" not in arguments.observers("mekf,me")
+    assert arguments.override_keys("noise.e") == ["noise.enabled="]
+    assert arguments.override_keys("vehicles.*.goal") == ["vehicles.*.goal.position=", "vehicles.*.goal.radius="]
 
 
 def test_every_completed_key_is_one_that_the_loader_knows() -> None:
-    keys = [key.removesuffix("=") for key in options.override_keys("") if "*" not in key]
+    keys = [key.removesuffix("=") for key in arguments.override_keys("") if "*" not in key]
     assert len(keys) > 50
     for key in keys:
         try:

@@ -14,8 +14,9 @@ from coopenv.observers.registry import find_embedded
 from coopenv.observers.riccati import DEAD_RECKONING
 from coopenv.observers.runner import start_covariances
 from coopenv.scenario import load_scenario
-from coopenv.world.dynamics import move, referee
+from coopenv.world.dynamics import move
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Source, sense_nothing
+from coopenv.world.referee import referee
 from coopenv.world.v2x import transmit
 from coopenv.world.world import World
 

@@ -8,7 +8,7 @@ import numpy as np
 from coopenv.base.errors import ActionError, CoopenvError, check_one_of, error_text, shown, suggest
 from coopenv.estimation import Outcome, Sight
 from coopenv.scenario import Scenario
-from coopenv.scenario.learning import LEVELS, PARAMETERS
+from coopenv.scenario.difficulty import LEVELS, PARAMETERS
 from coopenv.world.reset import ABSENT
 from coopenv.world.state import LASTING_ERRORS
 

@@ -9,33 +9,27 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NoReturn, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from coopenv.api.arguments import RewardFunction, Step, check_function, reward_of
-from coopenv.api.terms.layout import Layout, observation_layout
+from coopenv.api.plugins import PlugIns
+from coopenv.api.terms.layout import observation_layout
 from coopenv.api.terms.own import OwnTerms
 from coopenv.api.terms.results import MEMORY, results_struct, results_table, step_results, team_results
-from coopenv.base.columns import facts_html, one_line, picture_html
-from coopenv.base.errors import CoopenvError, Explained, check_memory, error_text, training_seed, world_keys
+from coopenv.base.errors import CoopenvError, check_memory, error_text
 from coopenv.base.installation import load_reference
+from coopenv.base.seeds import training_seed, world_keys
 from coopenv.episode import Frame
-from coopenv.estimation.poses import Coordinates, riccati_covariance
-from coopenv.observers.contract import Estimate
-from coopenv.observers.group import ObserverError, ObserverGroup
-from coopenv.observers.mailbox import Interference, interference_of
-from coopenv.observers.recording import Sensed
-from coopenv.observers.registry import find, states_covariance
 from coopenv.scenario import Scenario
-from coopenv.sources.base import Backend, SensingWorld
+from coopenv.sources.base import Backend
 from coopenv.sources.sources import simulation_of
 from coopenv.sources.tick_world import open_world
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
 from coopenv.world.model import device_memory
-from coopenv.world.quality import COORDINATES
 from coopenv.world.state import allocate, has_begun, overwrite, size_of
 from coopenv.world.world import Keys
 
@@ -311,229 +305,3 @@ class Engine:
         self.refresh()
         overwrite(memory, checked)
         self.begun = bool(has_begun(self.view("start_rotation")).all())
-
-
-NO_PICTURE = "render() shows nothing: make the environment with render_mode='rgb_array'"
-RENDER_HINT = "; render_mode is given where the environment is made"
-
-
-class Saved(Explained):
-    """Base class of the environments of an engine: its layout, and states that are saved and restored."""
-
-    engine: Engine
-    scenario: Scenario
-    metadata: dict[str, Any]
-    close: Any
-    _arguments: dict[str, Any]
-    """Arguments that build an equal environment."""
-
-    @property
-    def observation_layout(self) -> Layout:
-        """Name, slice, unit and scale of every field of the flat observation."""
-        return self.engine.layout.copy()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
-    def __len__(self) -> int:
-        """Return the number of vehicles in all worlds."""
-        return self.engine.world.worlds * len(self.scenario.vehicles)
-
-    def __getitem__(self, key: object) -> NoReturn:
-        """Refuse, also iteration and `in`, which ask for this."""
-        raise TypeError(f"'{type(self).__name__}' object is not subscriptable; reset() and step() return one per agent")
-
-    def __repr__(self) -> str:
-        return one_line(self, self.metadata["name"].removesuffix("_v0"), self._facts)
-
-    def _repr_html_(self) -> str:
-        """Return the main figures and, once an episode has begun, the top view of the first world."""
-        picture = picture_html(self.engine.picture()) if self.engine.begun else ""
-        return facts_html(self.scenario.title, self._facts) + picture
-
-    @property
-    def _facts(self) -> dict[str, object]:
-        worlds = {} if self.engine.world.worlds == 1 else {"worlds": self.engine.world.worlds}
-        return {**worlds, **self.scenario.facts}
-
-    def get_state(self) -> dict[str, Any]:
-        """Return everything that the next step depends on, random streams included; see `set_state`."""
-        return {"scenario": self.scenario, **self.engine.get_state()}
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `get_state`, of this or an equal environment.
-
-        A state is data except for plug-in observers, which are objects: a pickled state of unknown origin is as
-        dangerous as any pickle.
-
-        Raises:
-            CoopenvError: it is of another kind of environment, or not valid; nothing has changed then.
-        """
-        try:
-            if not isinstance(state, Mapping):
-                raise CoopenvError(f"not a mapping, but {type(state).__name__}")
-            if state.get("scenario") != self.scenario:
-                raise CoopenvError("it is of another scenario")
-            self._restore(state)
-        except CoopenvError as error:
-            raise CoopenvError(f"this state does not fit {self.metadata['name']}: {error}") from None
-
-    def _restore(self, state: Mapping[str, Any]) -> None:
-        self.engine.set_state(state)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"arguments": self._arguments, "state": self.get_state()}
-
-    def __setstate__(self, saved: dict[str, Any]) -> None:
-        self.__init__(**saved["arguments"])  # type: ignore[misc]
-        self.set_state(saved["state"])
-
-
-class PlugIns:
-    """A group of observers per world.
-
-    Estimates are written into the world's state, from which observations, rewards and metrics follow as for the
-    embedded observer. Where an estimate has no covariance, the scenario's P(0) stands for it.
-    """
-
-    def __init__(self, name: str, world: SensingWorld) -> None:
-        """Find the observer.
-
-        Raises:
-            CoopenvError: no such observer, or the world is not on the CPU.
-        """
-        factory = find(name)
-        if world.scenario.topology.most_nearby is not None:
-            raise CoopenvError(f"topology.most_nearby: observer '{name}' runs on the host and keeps all; leave it out")
-        if world.device != "cpu":
-            raise CoopenvError(f"observer '{name}' runs on the host; use device='cpu' instead of '{world.device}'")
-        self.name, self._world = name, world
-        observer_init = world.observer_init
-        self.groups = [ObserverGroup(factory, observer_init) for _ in range(world.worlds)]
-        self._order = observer_init.order
-        self._ticking = np.zeros(world.worlds, dtype=bool)  # worlds that are in the tick under way
-        self._failures: dict[int, str] = {}
-
-    def start(self, worlds: np.ndarray) -> None:
-        """Start the observers of the given worlds (indices), which have just been reset.
-
-        Raises:
-            CoopenvError: an observer cannot start.
-        """
-        R, p = self._world.view("estimate_rotation"), self._world.view("estimate_position")
-        for w in worlds.tolist():
-            self._failures.pop(w, None)
-            rotation = np.array(R[w], dtype=float)
-            position = (rotation @ np.array(p[w], dtype=float)[..., None])[..., 0]
-            with self._naming_the_observer():
-                self.groups[w].start(rotation, position, self._interference(w, 0))
-            if states_covariance(self.name):
-                for vehicle, P in enumerate(self._world.observer_init.start_covariance):
-                    self._write_covariance(w, vehicle, Estimate(rotation[vehicle], position[vehicle], P))
-
-    def load(self) -> None:
-        """Load the kernels of the stages, see `World.load`."""
-        world = self._world
-        world.restart()
-        world.mask.fill_(1)
-        world.decide()
-        world.sense()
-        world.receive(0)
-        world.broadcast(0)
-        world.finish()
-        world.mask.zero_()
-
-    def advance(self, ticks: int) -> None:
-        """Run camera ticks, stopping each world at its horizon; worlds in the world's mask stay as they are.
-
-        Raises:
-            CoopenvError: an observer failed; its world has to be reset.
-        """
-        self._world.decide()
-        for _ in range(ticks):
-            active = (self._world.mask.numpy() == 0) & (self._world.view("tick") < self._world.model.horizon_ticks)
-            if not active.any() or not self._world.fetch():
-                return
-            self._tick(active)
-
-    def _tick(self, active: np.ndarray) -> None:
-        world, worlds = self._world, np.flatnonzero(active).tolist()
-        for w in worlds:
-            if w in self._failures:
-                raise CoopenvError(f"{self._failures[w]} (reset starts anew)")
-        self._ticking = active
-        world.sense()
-        sensed = {w: world.sensed(w, int(world.view("tick")[w]) + 1) for w in worlds}
-        joint = self.groups[0].joint
-        with self._naming_the_observer():
-            for w in worlds if joint else ():
-                faults = self._interference(w, sensed[w].index)
-                for i, answer in enumerate(self.groups[w].update_all(sensed[w], faults)):
-                    self._write(w, i, answer.estimate)
-            for vehicle in self._order:
-                world.receive(vehicle)
-                for w in () if joint else worlds:
-                    self._write(w, vehicle, self._estimate(w, vehicle, sensed[w]))
-                world.broadcast(vehicle)
-        world.finish()
-
-    def _estimate(self, w: int, vehicle: int, sensed: Sensed) -> Estimate:
-        interference, view = self._interference(w, sensed.index), self._world.view
-        if interference is not None and interference.restarts[vehicle]:
-            for name in ("inbox_tick", "inbox_stamp"):
-                view(name)[w, vehicle] = -1
-        return self.groups[w].update(vehicle, sensed, view("inbox_tick")[w, vehicle], interference).estimate
-
-    def _interference(self, w: int, k: int) -> Interference | None:
-        return interference_of(self._world.scenario, self._world.model, self._world.view, w, k)
-
-    @contextmanager
-    def _naming_the_observer(self) -> Iterator[None]:
-        """Name the observer in an error, and remember it for the worlds that were in this tick: it has no end."""
-        try:
-            yield
-        except ObserverError as failure:
-            message = f"observer '{self.name}' {failure}"
-            self._failures.update(dict.fromkeys(np.flatnonzero(self._ticking).tolist(), message))
-            raise CoopenvError(message) from failure.__cause__
-
-    def _write(self, w: int, vehicle: int, estimate: Estimate) -> None:
-        R, view = np.asarray(estimate.rotation, dtype=float), self._world.view
-        view("estimate_rotation")[w, vehicle] = R
-        view("estimate_position")[w, vehicle] = R.T @ np.asarray(estimate.position, dtype=float)
-        self._write_covariance(w, vehicle, estimate)
-        view("protection_level")[w, vehicle] = 0.0 if estimate.protection_level is None else estimate.protection_level
-
-    def _write_covariance(self, w: int, vehicle: int, estimate: Estimate) -> None:
-        gains, P, coordinates = self._world.model.observer, estimate.covariance, Coordinates.RICCATI
-        if P is None:
-            kept = np.diag(np.repeat([float(gains.p1), float(gains.p2)], 3))
-        else:
-            coordinates = estimate.coordinates
-            kept = riccati_covariance(coordinates, estimate.rotation, estimate.position, P)
-        self._world.view("covariance")[w, vehicle] = kept
-        self._world.view("coordinates")[w, vehicle] = COORDINATES.index(coordinates)
-
-    def get_state(self) -> list[dict[str, Any]]:
-        """Return a deep copy of every observer and message.
-
-        Raises:
-            CoopenvError: an observer cannot be copied.
-        """
-        return [group.get_state() for group in self.groups]
-
-    def set_state(self, states: Any, begun: np.ndarray) -> None:
-        """Restore a state of `get_state`, of worlds (W,) of which some have begun.
-
-        Raises:
-            CoopenvError: it is of other observers; nothing has changed then.
-        """
-        if not isinstance(states, list) or len(states) != len(self.groups):
-            raise CoopenvError(f"state: no observers '{self.name}' in it")
-        copies = [group.checked_state(*state) for group, *state in zip(self.groups, states, begun, strict=True)]
-        for group, state in zip(self.groups, copies, strict=True):
-            group.set_state(state)
-        self._failures.clear()

@@ -12,7 +12,8 @@ import gymnasium
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.base.errors import CoopenvError, checked_seed
+from coopenv.base.errors import CoopenvError
+from coopenv.base.seeds import checked_seed
 from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array, position_covariance
 from coopenv.scenario import Scenario, load_scenario

@@ -23,9 +23,11 @@ from coopenv.api.arguments import (
     world_parameters,
     world_states,
 )
-from coopenv.api.engine import NO_PICTURE, RENDER_HINT, Engine, Saved
+from coopenv.api.engine import Engine
+from coopenv.api.saved import NO_PICTURE, RENDER_HINT, Saved
 from coopenv.api.terms.layout import action_space, observation_space
-from coopenv.base.errors import ActionError, CoopenvError, check_one_of, explained, shown, suggest, world_keys
+from coopenv.base.errors import ActionError, CoopenvError, check_one_of, explained, shown, suggest
+from coopenv.base.seeds import world_keys
 from coopenv.scenario import Scenario
 from coopenv.sources.base import EPISODE_OVER, IGNORED_OPTIONS, Backend, Broadcasting, Health
 from coopenv.sources.sources import simulation_of

@@ -64,7 +64,7 @@ def register_all() -> None:
         if identity not in gymnasium.registry:
             gymnasium.register(
                 identity,
-                entry_point="coopenv.policies.single_vehicle:SingleVehicleEnv",
+                entry_point="coopenv.api.single_vehicle:SingleVehicleEnv",
                 vector_entry_point="coopenv.api.make:make_rows",
                 kwargs=kwargs,
             )

@@ -23,10 +23,12 @@ from coopenv.api.arguments import (
     world_parameters,
     world_states,
 )
-from coopenv.api.engine import NO_PICTURE, RENDER_HINT, Engine, Saved
+from coopenv.api.engine import Engine
+from coopenv.api.saved import NO_PICTURE, RENDER_HINT, Saved
 from coopenv.api.terms.layout import action_space, observation_space
-from coopenv.base.errors import ActionError, CoopenvError, check_one_of, explained, world_keys
+from coopenv.base.errors import ActionError, CoopenvError, check_one_of, explained
 from coopenv.base.installation import install_command
+from coopenv.base.seeds import world_keys
 from coopenv.scenario import Scenario
 
 ArrayKind = Literal["numpy", "torch"]

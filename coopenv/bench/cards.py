@@ -18,10 +18,11 @@ from rich.table import Table
 
 from coopenv.api.engine import Engine
 from coopenv.base.columns import WIDTH, Columns, Tabular, one_line, picture_html, terminal_html
-from coopenv.base.errors import ActionError, CoopenvError, check_one_of, checked_seed
+from coopenv.base.errors import ActionError, CoopenvError, check_one_of
 from coopenv.base.files import check_file, replace_text
 from coopenv.base.format import NONE, json_text
 from coopenv.base.installation import is_installed, load_reference, version
+from coopenv.base.seeds import checked_seed
 from coopenv.base.terminal import text_of
 from coopenv.evaluation import METRICS, Difference, Episodes, Result, compare_paired, drive, held_out_seeds, score
 from coopenv.evaluation.metrics import LOSSES, LOST, SCORE, ranking_key

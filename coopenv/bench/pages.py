@@ -14,10 +14,11 @@ from PIL import Image
 
 from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import observation_layout
-from coopenv.base.errors import CoopenvError, world_keys
+from coopenv.base.errors import CoopenvError
 from coopenv.base.files import check_file, replace_text, replacing_file, writing
 from coopenv.base.format import json_text, number
 from coopenv.base.installation import environment_id, list_envs, version
+from coopenv.base.seeds import world_keys
 from coopenv.bench.cards import OVERVIEW, Contest, cells, rendered
 from coopenv.episode import Episode, Origin
 from coopenv.evaluation.metrics import SCORE

@@ -33,7 +33,8 @@ from coopenv.cars.calibration_batch import (
 )
 from coopenv.cars.calibration_drives import CalibrationDrive, CarDrive
 from coopenv.estimation.lens import PLUMB_BOB
-from coopenv.estimation.poses import Array, Mask
+from coopenv.estimation.poses import Array
+from coopenv.estimation.validity import Mask
 
 TRIED = 7  # hypotheses that are fitted in each round
 MOST = 4  # accepted hypotheses

@@ -31,7 +31,8 @@ from scipy.spatial.transform import Rotation
 from coopenv.base.errors import DataError
 from coopenv.cars.calibration_drives import CalibrationDrive, CarDrive, averaged
 from coopenv.estimation.lens import COEFFICIENTS, distort, largest_radius
-from coopenv.estimation.poses import Array, Mask, skew
+from coopenv.estimation.poses import Array, skew
+from coopenv.estimation.validity import Mask
 from coopenv.scenario import Scenario
 
 KEYFRAME = 0.1  # s

@@ -16,7 +16,8 @@ from scipy.optimize import least_squares
 
 from coopenv.base.errors import DataError
 from coopenv.cars.calibration_batch import LEAST_PLACE, LOSS, Kind, by_stretch, deviation, standard_errors
-from coopenv.estimation.poses import Array, Mask
+from coopenv.estimation.poses import Array
+from coopenv.estimation.validity import Mask
 from coopenv.world.dynamics import follow_commands
 from coopenv.world.launch import kernel, launch, start_warp
 

@@ -19,7 +19,7 @@ from coopenv.base import interrupts
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command
 from coopenv.base.installation import version as installed_version
-from coopenv.cli import options
+from coopenv.cli import arguments, commands, options
 from coopenv.cli.bench import bench, bench_observers
 from coopenv.cli.plugins import Extended
 from coopenv.cli.run import export, figures, record, run
@@ -69,7 +69,7 @@ class DescribeOptions(options.SourceOptions):
 
 
 @app.command(rich_help_panel=LOOK)
-@options.command
+@commands.command
 def describe(given: DescribeOptions) -> None:
     """Print a summary of an environment: vehicles, sensors, observer."""
     from coopenv.runs.summary import describe_scenario, document, summary
@@ -161,8 +161,8 @@ def page(
             metavar="ENV...",
             help="Names of environments or TOML files.",
             show_default=False,
-            autocompletion=options.environments,
-            callback=options.known_environments,
+            autocompletion=arguments.environments,
+            callback=arguments.known_environments,
         ),
     ] = None,
     everything: Annotated[bool, typer.Option("--all", help="Every environment that ships with coopenv.")] = False,
@@ -245,7 +245,7 @@ def failure_status(error: BaseException) -> int:
         return PIPE_CLOSED
     if isinstance(error, UsageError):
         words = error.format_message().replace("Value error, ", "")  # of the library that checks values
-        message = f"{words}{options.usage_hint(error)}"
+        message = f"{words}{commands.usage_hint(error)}"
     elif isinstance(error, CoopenvError):
         message = str(error)
     elif isinstance(error, OSError) or getattr(sys.stdout, "closed", False):
@@ -279,4 +279,4 @@ def root(
     if version:
         print(f"coopenv {installed_version()}")
     else:
-        options.print_help(context)
+        commands.print_help(context)

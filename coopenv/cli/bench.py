@@ -8,12 +8,12 @@ import typer
 
 from coopenv.base.errors import CoopenvError, listed
 from coopenv.base.installation import install_command, is_reference
-from coopenv.cli import options
+from coopenv.cli import arguments, commands, options
 
 if TYPE_CHECKING:
     from coopenv.bench.observers.comparison import Plan
 
-bench = options.group("Compare observers, study seeds.")
+bench = commands.group("Compare observers, study seeds.")
 First = Annotated[int, typer.Option(min=0, help="The first seed.")]
 
 
@@ -53,7 +53,7 @@ class ObserverOptions:
         typer.Option(
             help="Names of observers with commas between, or import paths, mine.py:Mine or package.module:Mine "
             "(default: all that suit).",
-            **options.OBSERVERS,
+            **arguments.OBSERVERS,
         ),
     ] = None
     variants: Annotated[
@@ -73,7 +73,7 @@ class ObserverOptions:
     ] = None
     policy: Annotated[
         str | None,
-        typer.Option("--policy", "--agent", help="Agent or policy that drives in the records.", **options.POLICY),
+        typer.Option("--policy", "--agent", help="Agent or policy that drives in the records.", **arguments.POLICY),
     ] = None
     seeds: Annotated[
         int | None, typer.Option(min=1, help="Number of seeds (default: 5; recorded robots and logs have one record).")
@@ -140,7 +140,7 @@ class ObserverOptions:
         faults = [name for name in plan.variants if name in added]
         observers = ",".join(dict.fromkeys(self.names or plan.observers))
         chosen = replace(self, observers=observers, variants=",".join(named), faults=faults)
-        return options.command_text("bench observers", chosen, OF_THE_OUTPUT)
+        return commands.command_text("bench observers", chosen, OF_THE_OUTPUT)
 
 
 OF_THE_OUTPUT = ("jobs", "engine", "address", "seconds", "memory", "out", "figures", "width", "open_report", "as_json")
@@ -148,7 +148,7 @@ OF_THE_OUTPUT = ("jobs", "engine", "address", "seconds", "memory", "out", "figur
 
 
 @bench.command("observers")
-@options.command
+@commands.command
 def bench_observers(given: ObserverOptions) -> None:
     """Compare observers on the same data and with their bound."""
     from coopenv.bench.executors import check_imports, find_executor
@@ -192,7 +192,7 @@ def bench_v1(
         typer.Argument(
             metavar="OBSERVERS",
             help="mine.py:Mine, package.module:Mine or names, with commas between.",
-            **options.OBSERVERS,
+            **arguments.OBSERVERS,
         ),
     ],
     scenes: Annotated[str | None, typer.Option(help="Some scenes only, with commas between, for a trial.")] = None,
@@ -217,7 +217,7 @@ def bench_v1(
     usual = benchmark.limits
     limits = ProcessLimits(seconds or usual.seconds, memory or usual.mebibytes)
     with Progress(log, "bench v1", total=1.0) as progress:
-        names, some = options.words(observers), options.words(scenes)
+        names, some = arguments.words(observers), arguments.words(scenes)
         result = benchmark.run(names, some, jobs or available_cores(), limits, progress.update)
     replace_text(out, json_text(result))
     if as_json:
@@ -238,7 +238,7 @@ def bench_learning(
     study: Annotated[
         Path,
         typer.Argument(
-            help="TOML file of the study, such as agents/study.toml.", callback=options.existing("file of a study")
+            help="TOML file of the study, such as agents/study.toml.", callback=arguments.existing("file of a study")
         ),
     ],
     out: Annotated[Path | None, typer.Option(help="Folder for the agents (default: beside the study).")] = None,
@@ -257,7 +257,7 @@ def bench_learning(
         from coopenv.bench import learning
 
     whole, log = learning.read_study(study), options.console(stderr=True)
-    chosen, folder = whole.only(options.words(only)), out or study.parent
+    chosen, folder = whole.only(arguments.words(only)), out or study.parent
     for plans in chosen.agents.values():
         options.load(plans[0].environment, plans[0].settings.scenario)
     learning.run(whole, chosen, folder, logs, jobs or available_cores(), worlds, log)

@@ -13,12 +13,12 @@ from typer.core import TyperCommand
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.plugins import loaded, offered, own
-from coopenv.cli import options
+from coopenv.cli import commands
 
 GROUP = "coopenv.commands"
 
 
-class Extended(options.Grouped):
+class Extended(commands.Grouped):
     """The commands of coopenv, and those of guests and packages, each loaded when it is looked for."""
 
     @property

@@ -6,15 +6,12 @@ import warnings
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from coopenv.base.errors import CoopenvError, DataWarning
-from coopenv.cli import options
-
-if TYPE_CHECKING:
-    pass
+from coopenv.cli import arguments, commands, options
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +44,7 @@ class RunOptions(options.SourceOptions):
         return with_observer(super().changes, self.observer)
 
 
-@options.command
+@commands.command
 def run(given: RunOptions) -> None:
     """Run an environment; write metrics, arrays, figures and a page that plays the episode."""
     name = Path(given.environment).stem
@@ -82,7 +79,7 @@ def run(given: RunOptions) -> None:
 
 RunFolder = Annotated[
     Path,
-    typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.", callback=options.existing("run")),
+    typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.", callback=arguments.existing("run")),
 ]
 
 
@@ -112,7 +109,7 @@ class RecordOptions(options.SourceOptions):
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False
 
 
-@options.command
+@commands.command
 def record(given: RecordOptions) -> None:
     """Write what vehicles sense to an MCAP file, and beside it a page that plays the episode.
 
@@ -191,7 +188,7 @@ Exported = Annotated[
     typer.Argument(
         metavar="RUN|FILE.mcap",
         help="Folder that `coopenv run` has written, or log of `record`.",
-        callback=options.existing("run or log"),
+        callback=arguments.existing("run or log"),
     ),
 ]
 LAYOUT_FILE = "foxglove_layout.json"

@@ -9,7 +9,7 @@ import typer
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, needing
-from coopenv.cli import options
+from coopenv.cli import arguments, commands, options
 
 if TYPE_CHECKING:
     from coopenv.training.ranking import Ranking
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 Settings = Annotated[Path | None, typer.Option(help="TOML file of the settings (default: see docs/trainers.md).")]
 Agent = Annotated[
     str | None,
-    typer.Option(help="Agent with the settings, train.toml, in its folder.", **options.AGENT),
+    typer.Option(help="Agent with the settings, train.toml, in its folder.", **arguments.AGENT),
 ]
 Onnx = Annotated[bool, typer.Option("--onnx", help="Also write the policy as an ONNX model.")]
 
@@ -38,7 +38,7 @@ class TrainOptions:
     ] = None
     minutes: Annotated[float | None, typer.Option(min=1e-3, help="Longest time to learn, min; stops --steps.")] = None
     start: Annotated[
-        str | None, typer.Option("--from", help="Learned agent that the training continues.", **options.AGENT)
+        str | None, typer.Option("--from", help="Learned agent that the training continues.", **arguments.AGENT)
     ] = None
     overrides: options.Overrides = None
     out: Annotated[Path | None, typer.Option(help="The agent's folder (default: out/train/ENV).")] = None
@@ -101,7 +101,7 @@ class TrainOptions:
         return read_settings(path, self.arm, Path(self.environment).stem, **changes)
 
 
-@options.command
+@commands.command
 def train(given: TrainOptions) -> None:
     """Train one policy for all vehicles with PPO, and write it as an agent.
 
@@ -178,7 +178,7 @@ class EvaluateOptions:
         typer.Option(
             help="Agents with commas between: names, folders, or mine.py:Mine or package.module:Mine (default: every "
             "agent of agents/ that was made for ENV).",
-            **options.AGENTS,
+            **arguments.AGENTS,
         ),
     ] = None
     worlds: Annotated[
@@ -208,7 +208,7 @@ OF_THE_OUTPUT = ("out", "figures", "width", "no_figures", "film", "write_card", 
 """Options of `evaluate` that do not change the results."""
 
 
-@options.command
+@commands.command
 def evaluate(given: EvaluateOptions) -> None:
     """Compare agents on held-out worlds: arrivals, collisions, time, errors."""
     from coopenv.bench import cards, evaluate
@@ -218,13 +218,13 @@ def evaluate(given: EvaluateOptions) -> None:
         raise CoopenvError("--film: the film needs a folder, --out DIR")
     if given.stress and (given.film or given.write_card):
         raise CoopenvError("--stress prints a table: leave out --film and --write-card")
-    names = options.words(agents)
+    names = arguments.words(agents)
     if agents is not None and not names:
         raise CoopenvError(f"--agents {agents}: names no agent; leave it out for all agents of {environment}")
     changes = options.parse_overrides(given.overrides)
     contest = cards.Contest.of(environment, changes, names, given.worlds, given.seed_block, given.ideal, given.stress)
     carded = cards.carded(contest) if given.write_card else []
-    command = options.command_text("evaluate", given, OF_THE_OUTPUT)
+    command = commands.command_text("evaluate", given, OF_THE_OUTPUT)
     drawn = {
         "figures": None if given.no_figures or given.stress else given.figures.value,
         "width": given.width and given.width.value,
@@ -253,7 +253,7 @@ class DatasetOptions:
         typer.Option(
             "--policy",
             help="Driver: random, the name of an agent, its folder, or mine.py:Mine.",
-            **options.POLICY,
+            **arguments.POLICY,
         ),
     ] = "route_follower"
     worlds: Annotated[
@@ -270,7 +270,7 @@ class DatasetOptions:
     force: Annotated[bool, typer.Option("--force", help="Replace an existing dataset.")] = False
 
 
-@options.command
+@commands.command
 def dataset(given: DatasetOptions) -> None:
     """Write episodes of a policy as a Minari dataset, one per vehicle."""
     environment, policy, log = given.environment, given.policy, options.console(stderr=True)
@@ -287,7 +287,7 @@ def dataset(given: DatasetOptions) -> None:
     place = dataset_place(identity, given.out, given.force)
     with Progress(log, "driving", total=1.0) as progress, compile_notice(log):
         episodes = drive_vehicles(scenario, driver, given.seed, given.worlds, progress.update)
-    again = options.command_text("dataset", given, ("identity", "out", "force"))
+    again = commands.command_text("dataset", given, ("identity", "out", "force"))
     facts = {"algorithm_name": own, "description": f"{scenario.title}: {again}"}
     write_dataset(episodes, scenario, registered_spec(environment, changes), place, identity, facts)
     steps = sum(len(episode.actions) for episode in episodes)

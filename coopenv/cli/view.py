@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cli import options
+from coopenv.cli import arguments, commands, options
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,7 +27,7 @@ Agent = Annotated[
         "--policy",
         help="Driver: zero, random, the name of an agent, its folder, or mine.py:Mine (default: look_ahead or peek, if "
         "made for the environment; else route_follower, where it can drive).",
-        **options.POLICY,
+        **arguments.POLICY,
     ),
 ]
 SceneSource = Annotated[
@@ -36,8 +36,8 @@ SceneSource = Annotated[
         metavar="ENV|FILE.mcap|BAG|RUN",
         help="Environment (name or TOML file), a log file, a ROS bag, recorded robots (mrclam_1 .. mrclam_9), or the "
         "folder of a run.",
-        autocompletion=options.environments,
-        callback=options.known_source,
+        autocompletion=arguments.environments,
+        callback=arguments.known_source,
     ),
 ]
 
@@ -96,7 +96,7 @@ class FilmOptions(SceneOptions):
         typer.Option(
             help="Driver, as of `coopenv view`; several with commas between: their films side by side.",
             show_default=False,
-            **options.POLICIES,
+            **arguments.POLICIES,
         ),
     ] = None
     observer: Annotated[
@@ -104,7 +104,7 @@ class FilmOptions(SceneOptions):
         typer.Option(
             help="Observer (default: that of the environment); several with commas between: their films side by side.",
             show_default=False,
-            **options.OBSERVERS,
+            **arguments.OBSERVERS,
         ),
     ] = None
     out: Annotated[Path, typer.Option(help="File to write: .mp4, .gif or .webp.")]
@@ -123,7 +123,7 @@ class FilmOptions(SceneOptions):
         str,
         typer.Option(
             help="With --3d: overview, follow, pair or driver; several with commas between: one below another.",
-            autocompletion=options.completion(lambda: ("overview", "follow", "pair", "driver"), several=True),
+            autocompletion=arguments.completion(lambda: ("overview", "follow", "pair", "driver"), several=True),
         ),
     ] = "overview"
     vehicle: Annotated[
@@ -142,14 +142,14 @@ class FilmOptions(SceneOptions):
         saved = self.saved()
         if saved is not None:
             return [(self.headings or "", saved)]
-        observers: list[str | None] = [*options.words(self.observer)] or [None]
-        agents: list[str | None] = [*options.words(self.agent)] or [None]
+        observers: list[str | None] = [*arguments.words(self.observer)] or [None]
+        agents: list[str | None] = [*arguments.words(self.agent)] or [None]
         pairs = [(observer, agent) for observer in observers for agent in agents]
         names = [
             ", ".join(n for n, of in ((observer, observers), (agent, agents)) if n is not None and len(of) > 1)
             for observer, agent in pairs
         ]
-        if (headings := options.words(self.headings)) and len(headings) != len(pairs):
+        if (headings := arguments.words(self.headings)) and len(headings) != len(pairs):
             raise CoopenvError(f"--headings: expected one for each of {len(pairs)} films, got {len(headings)}")
         return [
             (name, replace(self, observer=observer, agent=agent)._played(log))
@@ -177,10 +177,10 @@ class FilmOptions(SceneOptions):
             panel = not self.map_only and len(takes) == 1
             return [[Shot(record, TopView(record.scenario, panel=panel), name) for name, record in takes]]
         picked = vehicle_index(takes[0][1].scenario, self.vehicle)
-        return space_film(takes, self.width, options.words(self.camera), picked)
+        return space_film(takes, self.width, arguments.words(self.camera), picked)
 
 
-@options.command
+@commands.command
 def film(given: FilmOptions) -> None:
     """Film an episode, or several side by side, from above or in 3-D: MP4, GIF or WebP."""
     from coopenv.base.files import check_file
@@ -189,9 +189,9 @@ def film(given: FilmOptions) -> None:
 
     out, log = given.out, options.console(stderr=True)
     if given.space:
-        options.refuse(given, ("map_only",), "is for a film from above, without --3d")
+        commands.refuse(given, ("map_only",), "is for a film from above, without --3d")
     else:
-        options.refuse(given, ("camera", "vehicle"), "is for a 3-D film, with --3d")
+        commands.refuse(given, ("camera", "vehicle"), "is for a 3-D film, with --3d")
     rate = given.fps or (20.0 if out.suffix == ".mp4" else 10.0)
     check_film(out)
     check_file(out)
@@ -202,8 +202,7 @@ def film(given: FilmOptions) -> None:
     options.console().print(f"{out}: {pictures} pictures, {pictures / rate:.3g} s, {size:.2g} MB", soft_wrap=True)
 
 
-CARS = "svea"
-"""The source that stands for the cars of a deployment."""
+watched = arguments.late("coopenv.sources.registry:watched")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,8 +215,8 @@ class ViewOptions(SceneOptions):
             metavar="ENV|FILE.mcap|BAG|RUN|svea",
             help="Environment (name or TOML file), a log file, a ROS bag, recorded robots (mrclam_1 .. mrclam_9), the "
             "folder of a run, or svea: the cars of --deployment.",
-            autocompletion=options.environments,
-            callback=lambda name: name if name == CARS else options.known_source(name),
+            autocompletion=arguments.environments,
+            callback=lambda name: name if name in watched() else arguments.known_source(name),
         ),
     ]
     vehicle: Annotated[str | None, typer.Option(help="Vehicle to look at first, vehicle_1 or f1.")] = None
@@ -233,13 +232,15 @@ class ViewOptions(SceneOptions):
 
     def open(self, more: Mapping[str, Any] | None = None) -> "Backend":
         """Return the source of ticks, cars included."""
-        if self.environment != CARS or self.deployment is None:
+        if self.environment not in watched() or self.deployment is None:
             return super().open(more)
         from coopenv.sources.sources import open_backend
 
         watching = {} if self.observer is None else {"observer.name": self.observer}
         changes = {**self.changes, **watching, **(more or {})}
-        return open_backend(self.deployment, CARS, changes, options={"connect": self.connect, "watch": True})
+        return open_backend(
+            self.deployment, self.environment, changes, options={"connect": self.connect, "watch": True}
+        )
 
     def reel(self) -> "Reel":
         """Return the source of frames; cars are observed and not driven.
@@ -250,15 +251,19 @@ class ViewOptions(SceneOptions):
         from coopenv.runs.live import EngineReel, Reel
         from coopenv.runs.scenes import title_of
 
-        if self.environment == CARS:
+        if self.environment in watched():
             if self.deployment is None:
-                raise CoopenvError("--deployment: needed by coopenv view svea, the deployment file of the cars")
+                raise CoopenvError(
+                    f"--deployment: needed by coopenv view {self.environment}, the deployment file of the cars"
+                )
             if self.agent is not None:
-                raise CoopenvError("--agent: is for a simulation; coopenv svea run --arm lets an agent drive cars")
+                raise CoopenvError(
+                    f"--agent: is for a simulation; coopenv {self.environment} run --arm lets an agent drive cars"
+                )
             return EngineReel(self.open, self.deployment.stem, self.seed, lambda scenario: (None, ""))
         for option, value in (("--deployment", self.deployment), ("--connect", self.connect)):
             if value is not None:
-                raise CoopenvError(f"{option} {value}: is for coopenv view svea")
+                raise CoopenvError(f"{option} {value}: is for coopenv view {' or '.join(watched())}")
         saved = self.saved()
         return (
             EngineReel(self.open, title_of(self.environment), self.seed, self.driver)
@@ -267,7 +272,7 @@ class ViewOptions(SceneOptions):
         )
 
 
-@options.command
+@commands.command
 def view(given: ViewOptions) -> None:
     """Watch an environment, a record or cars live in the browser; Ctrl-C ends it.
 
@@ -304,8 +309,8 @@ def watch(
         typer.Argument(
             metavar="AGENT",
             help="Name of an agent, its folder, or where its class stands, mine.py:Mine or package.module:Mine.",
-            autocompletion=options.agents,
-            callback=options.known_agents,
+            autocompletion=arguments.agents,
+            callback=arguments.known_agents,
         ),
     ],
     environment: Annotated[
@@ -313,7 +318,7 @@ def watch(
         typer.Option(
             "--env",
             help="Name or TOML file of the environment (default: the first that the agent was made for).",
-            **options.ENVIRONMENT,
+            **arguments.ENVIRONMENT,
         ),
     ] = None,
     seed: options.Seed = 0,
@@ -354,7 +359,7 @@ def play(
         str | None,
         typer.Option(
             help="Policy of the other vehicles (default: route_follower where it can drive).",
-            **options.POLICY,
+            **arguments.POLICY,
         ),
     ] = None,
     seed: options.Seed = 0,

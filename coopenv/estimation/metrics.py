@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.observability import Observability, Trajectory, slowest_decay
+from coopenv.estimation.observability import Observability, slowest_decay
 from coopenv.estimation.poses import Array, Coordinates, covariance_in_map, orientation_error_deg
+from coopenv.estimation.trajectory import Trajectory
 
 STEADY_SHARE = 0.7  # the steady state is taken to begin after this share of the horizon (35 s of 50 s)
 MOST_SHOWN = 12  # vehicles in figures and printed tables; of a larger fleet, the ones with the largest errors

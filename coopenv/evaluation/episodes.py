@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.base.errors import CoopenvError, evaluation_seed, world_keys
+from coopenv.base.errors import CoopenvError
+from coopenv.base.seeds import evaluation_seed, world_keys
 from coopenv.episode import Views
 from coopenv.estimation import Outcome, Sight
 from coopenv.policies import Policy, decide, restart
@@ -106,16 +107,18 @@ class Episodes:
         """(W, N) number of decisions for which a vehicle counts as lost after its last one; 0: it is not lost.
 
         A vehicle is lost after a collision, off its route, and at any other end but an arrival at its goal. It counts
-        for the rest of its way at the mean pace that it had, at most for another episode; without a goal for the rest
-        of the episode. What is left of the way is the straight line to the goal, as a share of the route's length.
+        for the rest of its way at the mean pace that it had, at most for another episode; without a goal, or after an
+        arrival, for the rest of the episode. What is left of the way is the straight line to the goal, as a share of
+        the route's length.
         """
-        failed = np.isin(self.outcome, (Outcome.COLLIDED, Outcome.OFF_ROUTE)) | (self.goal & (self.arrivals[-1] == 0))
+        to_goal = self.goal & (self.arrivals[-1] == 0)
+        failed = np.isin(self.outcome, (Outcome.COLLIDED, Outcome.OFF_ROUTE)) | to_goal
         steps = self.under_way.sum(axis=0)
         last = np.take_along_axis(self.position, steps[None, ..., None], axis=0)[0]
         length = np.linalg.norm(np.diff(self.route, axis=2), axis=-1).sum(axis=-1)
         left = np.clip(np.linalg.norm(last - self.route[:, :, -1], axis=-1) / np.maximum(length, 1e-6), 0.0, 1.0)
         rest = np.minimum(steps * left / np.maximum(1.0 - left, 1e-6), self.horizon)
-        rest = np.where(np.isfinite(rest), rest, self.horizon - steps)
+        rest = np.where(to_goal, rest, self.horizon - steps)
         return np.where(failed & self.present, np.maximum(np.rint(rest), 1), 0).astype(int)
 
     @property

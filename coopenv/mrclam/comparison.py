@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from coopenv.bench.observers.faults import ROBOT_VARIANTS
 from coopenv.bench.observers.sources import RecordSource, already_warned
 from coopenv.mrclam.dataset import IN_SPACE
+from coopenv.mrclam.source import MRCLAM
 from coopenv.observers.recording import Recording
 from coopenv.sources.selection import WHOLE, Selection
 from coopenv.sources.sources import open_recording
@@ -20,8 +20,8 @@ class Robots(RecordSource):
     data: Path | None
     """The folder with the data; None: the environment variable COOPENV_DATA."""
     selection: Selection = WHOLE
-    named: ClassVar[Mapping[str, str]] = ROBOT_VARIANTS
-    usual: ClassVar[tuple[str, ...]] = tuple(ROBOT_VARIANTS)
+    named: ClassVar[Mapping[str, str]] = MRCLAM.variants
+    usual: ClassVar[tuple[str, ...]] = tuple(MRCLAM.variants)
     windowed: ClassVar[bool] = False
 
     @property

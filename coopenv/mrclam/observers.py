@@ -3,4 +3,4 @@
 from coopenv.observers.registry import ZooEntry
 
 PLANAR_EKF = ZooEntry("planar:PlanarEkf", package=__package__, in_space=False)
-PLANAR_ROBUST = ZooEntry("planar:PlanarRobust", package=__package__, in_space=False)
+PLANAR_ROBUST = ZooEntry("planar:PlanarRobust", package=__package__, in_space=False, of_robots=True)

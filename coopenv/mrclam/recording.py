@@ -20,7 +20,8 @@ from coopenv.estimation.poses import Array, about_z
 from coopenv.mrclam.dataset import MAX_TRUTH_GAP_S, ROBOTS, Dataset, HeldCommands, Robot, arc, load_dataset
 from coopenv.mrclam.planar_model import ARC, CALIBRATING, IROBOT_CREATE, PATH, SLOWING, TURN, TURNING, CommandHistory
 from coopenv.observers.contract import Gains, SensorNoise, Setup
-from coopenv.observers.recording import Recording, Truth, check_recording, received_by_all
+from coopenv.observers.recording import Recording, check_recording, received_by_all
+from coopenv.observers.sensed import Truth
 
 __all__ = ["VARIANTS", "Dataset", "Variant", "load_dataset", "recording_of"]
 

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from coopenv.base.sections import LARGEST
-from coopenv.estimation.poses import (
-    Array,
+from coopenv.estimation.poses import Array
+from coopenv.estimation.validity import (
     Fields,
     Mask,
     Rule,

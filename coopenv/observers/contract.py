@@ -16,7 +16,8 @@ from scipy.linalg.lapack import dpotrf
 
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.sections import LARGEST
-from coopenv.estimation.poses import MAX_BEND, MOST_LOPSIDED, Array, Coordinates, are_rotations
+from coopenv.estimation.poses import Array, Coordinates
+from coopenv.estimation.validity import MAX_BEND, MOST_LOPSIDED, are_rotations
 
 BYTES_PER_NUMBER = 8
 MIN_BEARING_STD = 1e-4  # rad; noise-free scenarios would leave a Kalman filter with a singular innovation

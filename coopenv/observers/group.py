@@ -28,8 +28,9 @@ from coopenv.observers.contract import (
     check_estimate,
     check_message,
 )
-from coopenv.observers.mailbox import Interference, Mailbox, altered
-from coopenv.observers.recording import Sensed
+from coopenv.observers.faults import Interference, altered
+from coopenv.observers.mailbox import Mailbox
+from coopenv.observers.sensed import Sensed
 
 
 class ObserverError(CoopenvError):

@@ -1,124 +1,37 @@
-"""Measurements of vehicles: of one tick, and of a whole record."""
+"""A recording of what vehicles measured, the checks of one, and its construction from arrays of any robots."""
 
 import math
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
-from itertools import chain
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from numbers import Integral, Real
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coopenv.base.errors import CoopenvError, DataError, DataWarning, shown
+from coopenv.base.errors import DataError, DataWarning, shown
 from coopenv.base.sections import LARGEST
-from coopenv.estimation.poses import (
-    MISFIT_DEG,
-    Array,
-    Mask,
-    are_numbers,
-    are_unit_vectors,
-    bearing_misfit_deg,
-    everywhere,
-    exp_so3,
-    exp_translation,
-)
-from coopenv.observers.arrays import ARRAYS, KINDS_OF_TICKS, invalid_rows, misshapen, sizes_of
-from coopenv.observers.contract import Gains, ObserverInit, Received, SensorNoise, Setup, Tick, sealed
-from coopenv.scenario.learning import MOST, PARAMETERS
+from coopenv.estimation.poses import MISFIT_DEG, Array, bearing_misfit_deg, exp_so3, exp_translation
+from coopenv.estimation.validity import Mask, are_numbers, are_unit_vectors, everywhere
+from coopenv.observers.arrays import ARRAYS, invalid_rows, misshapen, sizes_of
+from coopenv.observers.contract import Gains, ObserverInit, Received, SensorNoise, Setup, Tick
+from coopenv.observers.faults import Interference
+from coopenv.observers.sensed import MEASURED, Measurements, Sensed, Truth, is_due
+from coopenv.scenario import Scenario
+from coopenv.scenario.difficulty import MOST, PARAMETERS
 from coopenv.scenario.schema import neighbour_sets, processing_order
-
-if TYPE_CHECKING:
-    from coopenv.observers.mailbox import Interference
-    from coopenv.scenario import Scenario
-
-
-@dataclass(frozen=True)
-class Truth:
-    """True states, which no observer reads, of one tick or (K, ...) of several; NaN if unknown."""
-
-    rotation: Array  # (..., N, 3, 3) body to map
-    position: Array  # (..., N, 3) map, m
-
-    @property
-    def known(self) -> NDArray[np.bool_]:
-        """(..., N) where the whole pose is known."""
-        whole = np.concatenate([self.rotation, self.position[..., None]], axis=-1)
-        return np.asarray(np.isfinite(whole).all(axis=(-1, -2)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Measurements:
-    """Measurements by N vehicles of T targets, the first L of which are landmarks; (K, ...) for several ticks."""
-
-    rotation: Array  # (..., N, 3, 3) odometry increments since the last tick
-    translation: Array  # (..., N, 3) m
-    velocity: Array  # (..., N, 3) m/s, last odometry sample
-    angular_velocity: Array  # (..., N, 3) rad/s
-    bearings: Array  # (..., N, T, 3) camera -> target, body frame, NaN where not measured
-    visible: NDArray[np.bool_]  # (..., N, T)
-    landmarks: Array  # (..., L, 3) map, m
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sensed(Measurements):
-    """Measurements of N vehicles at one tick; T targets, the first L of which are landmarks. Read-only.
-
-    Ticks are the frames of the scenario's camera rate, one after the other: tick k is due at k / rate. A vehicle's
-    row holds its measurements at that time; the row of a vehicle without data is not read.
-    """
-
-    index: int  # k
-    dt: float  # s, between ticks
-    due: bool = True  # whether the scenario's observer rate asks for a correction
-    pan: Array | None = None  # (N,) rad, by which cameras are turned to the left; None: 0
-    time: float | None = None  # s since the reset on the source's clock; None: index * dt
-    odometry_age: Array | None = None  # (N,) s since the last odometry sample; None: 0
-    bearing_age: Array | None = None  # (N,) s since the frame was exposed; None: 0
-    missing: NDArray[np.bool_] | None = None  # (N,) vehicles without data; None: none
-    late: NDArray[np.bool_] | None = None  # (N,) vehicles with data after the deadline; None: none
-    truth: Truth | None = None  # of this tick; None: not known
-    inbox_tick: NDArray[np.int64] | None = None
-    """(N receiver, N sender) tick of sending of the last message that arrived, -1: none, where the source knows what
-    its radio delivered; None: the scenario's radio decides. The contents are those of the senders' observers, which
-    keep it for `v2x.delay` ticks (at least one)."""
-    messages: Mapping[tuple[int, int], Received] = field(default_factory=dict)
-    """(receiver, sender) to a message that arrived since the last tick from a vehicle that is estimated elsewhere."""
-
-    def tick(self, setup: Setup, messages: Mapping[int, Received], interference: "Interference | None" = None) -> Tick:
-        """Return the read-only tick of one vehicle with its messages, and with the errors of its map."""
-        i, landmarks = setup.vehicle, self.landmarks
-        if interference is not None:
-            landmarks = sealed(landmarks + interference.map_error_of(i, self.index))
-        return Tick(
-            index=self.index,
-            time=self.index * self.dt if self.time is None else self.time,
-            dt=self.dt,
-            rotation=self.rotation[i],
-            translation=self.translation[i],
-            velocity=self.velocity[i],
-            angular_velocity=self.angular_velocity[i],
-            targets=sealed(setup.targets[:]),
-            bearings=sealed(self.bearings[i].take(setup.targets, axis=0)),
-            valid=sealed(self.visible[i].take(setup.targets)),
-            landmarks=landmarks,
-            messages=messages,
-            lever_arm=sealed(setup.lever_arm[:]),
-            noise=setup.noise.moving(self.velocity[i], self.angular_velocity[i]),
-            due=self.due,
-        )
 
 
 @dataclass(frozen=True)
 class Drawn:
     """The keys of the draws of a simulated episode: presence, routes and goals."""
 
-    key: int  # of the world's random streams, see `coopenv.base.errors`
+    key: int  # of the world's random streams, see `coopenv.base.seeds`
     episode: int
-    parameters: tuple[float, ...]  # factors, in the order of `coopenv.scenario.learning.PARAMETERS`
+    parameters: tuple[float, ...]  # factors, in the order of `coopenv.scenario.difficulty.PARAMETERS`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,9 +53,9 @@ class Recording(Measurements):
     start_covariance: Array  # (N, 6, 6) LEFT coordinates
     truth: Truth  # of the K ticks
     pan: Array | None = None  # (K, N) rad, by which cameras were turned to the left; None: never
-    scenario: "Scenario | None" = None  # the world that was recorded; None for recorded robots
+    scenario: Scenario | None = None  # the world that was recorded; None for recorded robots
     drawn: Drawn | None = None  # None: not simulated
-    interference: "Interference | None" = None  # of the world's faults with messages and observers; None: there is none
+    interference: Interference | None = None  # of the world's faults with messages and observers; None: there is none
 
     def __post_init__(self) -> None:
         for name, values in [*vars(self).items()]:
@@ -189,12 +102,6 @@ class Recording(Measurements):
             DataError: an array has another shape or holds what it must not; one line that names it.
         """
         given = {name: values for name, values in locals().items() if name in _SHAPES and values is not None}
-        arrays = {name: _numbers(name, values) for name, values in given.items()}
-        for name, rank in (("velocity", 3), ("landmarks", 2)):
-            _require(arrays[name].ndim == rank, f"{name}: expected {_SHAPES[name]}, got shape {arrays[name].shape}")
-        (K, N, _), L = arrays["velocity"].shape, len(arrays["landmarks"])
-        T = L + N
-        _require(K > 1 and N > 0, f"velocity: expected {_SHAPES['velocity']}, K > 1, got shape {(K, N, 3)}")
         for name, value, kind, expected in (
             ("dt", dt, Real, "a number of s"),
             ("period", period, Integral, "a whole number of ticks"),
@@ -207,25 +114,13 @@ class Recording(Measurements):
         std = _numbers("start_std", start_std)
         positive = std.shape == (2,) and (std > 0.0).all()
         _require(positive, f"start_std: expected two positive numbers, got {shown(start_std)}")
-        unknown = {"truth_position": np.full((K, N, 3), np.nan), "truth_rotation": np.full((K, N, 3, 3), np.nan)}
-        arrays = unknown | arrays
-        for name, array in arrays.items():
-            shape = tuple({"K": K, "N": N, "L": L, "T": T, "3": 3}[axis] for axis in _SHAPES[name].split())
-            _require(array.shape == shape, f"{name}: expected {_SHAPES[name]} = {shape}, got {array.shape}")
-        for name in ("landmarks", "velocity", "angular_velocity"):
-            _require(
-                np.isfinite(arrays[name]).all(),
-                f"{name}: not finite at {np.argwhere(~np.isfinite(arrays[name]))[:1].tolist()}",
-            )
-        for part in ("position", "rotation"):
-            arrays.setdefault(f"start_{part}", arrays[f"truth_{part}"][0])
-            known = np.isfinite(arrays[f"start_{part}"]).all()
-            _require(known, f"start_{part}: needed, as the first true one is not known")
+        arrays = _checked_arrays(given)
+        (K, N, _), L = arrays["velocity"].shape, len(arrays["landmarks"])
         turn, step = arrays["angular_velocity"] * dt, arrays["velocity"] * dt
         turn[0], step[0] = 0.0, 0.0
         names = (*(f"landmark_{n + 1}" for n in range(L)), *(f"vehicle_{n + 1}" for n in range(N)))
-        gains = Gains(1.0, np.full(T, 10.0), (0.1, 1.0), (float(std[0] ** 2), float(std[1] ** 2)), 0.1)
-        targets, here = np.arange(T), np.zeros(3)
+        gains = Gains(1.0, np.full(L + N, 10.0), (0.1, 1.0), (float(std[0] ** 2), float(std[1] ** 2)), 0.1)
+        targets, here = np.arange(L + N), np.zeros(3)
         recording = cls(
             setups=tuple(
                 Setup(i, names[L + i], names, L, np.delete(targets, L + i), here, here, noise, gains) for i in range(N)
@@ -249,14 +144,7 @@ class Recording(Measurements):
             truth=Truth(arrays["truth_rotation"], arrays["truth_position"]),
         )
         check_recording(recording, "recording")
-        for i in range(N):
-            k, n = np.nonzero(recording.visible[:, i, :L])
-            pose = recording.truth.rotation[k, i], recording.truth.position[k, i]
-            misfit = bearing_misfit_deg(*pose, recording.bearings[k, i, n], recording.landmarks[k, n])
-            if misfit > MISFIT_DEG:
-                why = "are truth_position in m and truth_rotation body to map?"
-                text = f"truth of vehicle_{i + 1}: bearings to landmarks are {misfit:.0f} deg off (median): {why}"
-                warnings.warn(DataWarning(text), stacklevel=2)
+        _warn_of_wrong_truth(recording)
         return recording
 
     @property
@@ -345,6 +233,44 @@ def _numbers(name: str, values: ArrayLike) -> Array:
         raise DataError(f"{name}: not an array of numbers ({error})") from None
 
 
+def _checked_arrays(given: Mapping[str, ArrayLike]) -> dict[str, Array]:
+    """Return the arrays of `Recording.from_arrays`, unknown truth as NaN, and initial estimates.
+
+    Raises:
+        DataError: an array has another shape than in `_SHAPES`, or is not finite where it must be.
+    """
+    arrays = {name: _numbers(name, values) for name, values in given.items()}
+    for name, rank in (("velocity", 3), ("landmarks", 2)):
+        _require(arrays[name].ndim == rank, f"{name}: expected {_SHAPES[name]}, got shape {arrays[name].shape}")
+    (K, N, _), L = arrays["velocity"].shape, len(arrays["landmarks"])
+    _require(K > 1 and N > 0, f"velocity: expected {_SHAPES['velocity']}, K > 1, got shape {(K, N, 3)}")
+    unknown = {"truth_position": np.full((K, N, 3), np.nan), "truth_rotation": np.full((K, N, 3, 3), np.nan)}
+    arrays = unknown | arrays
+    for name, array in arrays.items():
+        shape = tuple({"K": K, "N": N, "L": L, "T": L + N, "3": 3}[axis] for axis in _SHAPES[name].split())
+        _require(array.shape == shape, f"{name}: expected {_SHAPES[name]} = {shape}, got {array.shape}")
+    for name in ("landmarks", "velocity", "angular_velocity"):
+        wrong = np.argwhere(~np.isfinite(arrays[name]))
+        _require(not len(wrong), f"{name}: not finite at {wrong[:1].tolist()}")
+    for part in ("position", "rotation"):
+        arrays.setdefault(f"start_{part}", arrays[f"truth_{part}"][0])
+        known = np.isfinite(arrays[f"start_{part}"]).all()
+        _require(known, f"start_{part}: needed, as the first true one is not known")
+    return arrays
+
+
+def _warn_of_wrong_truth(recording: Recording) -> None:
+    """Warn if bearings to landmarks contradict the true poses of a vehicle."""
+    for i in range(len(recording.setups)):
+        k, n = np.nonzero(recording.visible[:, i, : recording.landmarks.shape[1]])
+        pose = recording.truth.rotation[k, i], recording.truth.position[k, i]
+        misfit = bearing_misfit_deg(*pose, recording.bearings[k, i, n], recording.landmarks[k, n])
+        if misfit > MISFIT_DEG:
+            why = "are truth_position in m and truth_rotation body to map?"
+            text = f"truth of vehicle_{i + 1}: bearings to landmarks are {misfit:.0f} deg off (median): {why}"
+            warnings.warn(DataWarning(text), stacklevel=3)
+
+
 def received_by_all(ticks: int, vehicles: int, period: int) -> NDArray[np.int64]:
     """Return (K, N, N) the tick of the last received message: sent one tick ago or more."""
     before = np.maximum(np.arange(ticks) - 1, 0)
@@ -354,56 +280,8 @@ def received_by_all(ticks: int, vehicles: int, period: int) -> NDArray[np.int64]
     return inbox
 
 
-def is_due(index: ArrayLike, ratio: float) -> NDArray[np.bool_]:
-    """Return at which ticks a correction at `ratio` times the camera's rate is due; at the start none is."""
-    k = np.asarray(index)
-    return np.asarray(np.floor(k * ratio + 1e-9) > np.floor(np.maximum(k - 1, 0) * ratio + 1e-9))
-
-
-MEASURED = tuple(field.name for field in fields(Measurements))
-"""Arrays that every tick has."""
 PER_TICK = (*MEASURED, "inbox_tick")
 """Arrays of a recording that every tick of it has."""
-ROWS_OF_MISSING = (*MEASURED[:6], "pan", "odometry_age", "bearing_age")
-"""Arrays of a tick of which the row of a missing vehicle is not read."""
-
-
-def check_tick(tick: Sensed, index: int, observer_init: ObserverInit) -> None:
-    """Refuse a tick that is not number `index` or holds what no kernel may read; rows of the missing are not read.
-
-    Raises:
-        CoopenvError: one line that names tick, field and vehicle.
-    """
-    if tick.index != index:
-        raise CoopenvError(f"tick {index}: index: got {tick.index!r:.40}")
-    if not math.isclose(tick.dt, observer_init.dt, rel_tol=1e-6):
-        raise CoopenvError(f"tick {index}: dt: expected {observer_init.dt:.6g} s, got {tick.dt!r:.40}")
-    if tick.time is not None and not 0.0 <= tick.time <= LARGEST:
-        raise CoopenvError(f"tick {index}: time: expected s since the reset, got {tick.time!r:.40}")
-    names = [name for name, spec in ARRAYS.items() if spec.axes[0] == "K" and name != "due"]
-    given = {name: attrgetter(name)(tick) for name in names if tick.truth is not None or "." not in name}
-    given = {name: value for name, value in given.items() if value is not None or name in MEASURED}
-    for problem in misshapen(given, sizes_of(observer_init.setups), KINDS_OF_TICKS):
-        raise CoopenvError(f"tick {index}: {problem}")
-    absent = given.get("missing", np.zeros(len(observer_init.setups), bool))
-    seen = tick.visible & ~absent[:, None]
-    given |= {"visible": seen, "bearings": np.where(seen[..., None], tick.bearings, np.nan)}
-    problems = invalid_rows(given, {"now": index, "period": 1}, ticks=False)
-    for name, valid, problem in chain(problems, _invalid_messages(tick, len(absent))):
-        valid = valid | absent if valid.ndim and name in ROWS_OF_MISSING else valid
-        if not valid.all():
-            whose = f" of {observer_init.setups[int(np.argmin(valid))].name}" if valid.ndim else ""
-            raise CoopenvError(f"tick {index}: {name}{whose}: {problem}")
-
-
-def _invalid_messages(tick: Sensed, vehicles: int) -> Iterator[tuple[str, Any, str]]:
-    if tick.messages and tick.inbox_tick is None:
-        yield "messages", np.False_, "where some come from elsewhere, inbox_tick says what became of the others"
-    known = range(vehicles)
-    for (receiver, sender), received in tick.messages.items():
-        possible = receiver in known and sender in known and receiver != sender
-        yield "messages", np.bool_(possible), f"({receiver!r:.20}, {sender!r:.20}) are not two vehicles"
-        yield "messages", (np.arange(vehicles) != receiver) | (received.age >= 0.0), "of negative age"
 
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")

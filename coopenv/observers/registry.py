@@ -36,6 +36,7 @@ class ZooEntry:
     in_space: bool = True  # whether it is meant for vehicles in space
     on_a_plane: bool = True
     """True if it is meant for robots on a plane whose odometry is their commands (`Setup.planar`)."""
+    of_robots: bool = False  # whether it is that of a recording of robots where none is named
     covariance: bool = True  # whether its P is meant as a covariance, and is no matrix of gains
     package: str = "coopenv.observers"  # of its modules
 
@@ -78,6 +79,11 @@ NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
 def zoo() -> dict[str, ZooEntry]:
     """Return the observers of coopenv by name; guests offer theirs as entry points."""
     return ZOO | {name: loaded(point, "observer") for name, point in own(GROUP).items()}
+
+
+def observer_of_robots() -> str:
+    """Return the name of the observer of a recording of robots, which has no scenario that names one."""
+    return next(name for name, row in zoo().items() if row.of_robots)
 
 
 class RegisteredObserver(NamedTuple):

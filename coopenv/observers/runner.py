@@ -18,8 +18,9 @@ from coopenv.estimation.metrics import nees as normalised_error
 from coopenv.estimation.poses import Array, Coordinates, orientation_error_deg
 from coopenv.observers.contract import Factory, Gains, ObserverInit, SensorNoise, Setup
 from coopenv.observers.group import ObserverError, ObserverGroup, Tamper, TimedEstimate
-from coopenv.observers.recording import Recording, Truth, recorded_arrays
+from coopenv.observers.recording import Recording, recorded_arrays
 from coopenv.observers.registry import find
+from coopenv.observers.sensed import Truth
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets
 

@@ -17,7 +17,7 @@ from coopenv.base import installation
 from coopenv.base.errors import CoopenvError, error_text, explained, printable, shown, suggest
 from coopenv.base.installation import data_directory, list_agents
 from coopenv.base.sections import Section, one_line, parsed, read_toml
-from coopenv.policies.base import PLAIN, Policy, decide, restart
+from coopenv.policies.base import PLAIN, Policy, decide, restart, zero_policy
 
 if TYPE_CHECKING:
     from coopenv.scenario import Scenario, ScenarioLike
@@ -268,6 +268,23 @@ def load_policy(name: str | Path | Callable[..., Any], scenario: Scenario, seed:
             return PLAIN[name](seed, scenario.action_size)
         check_agent(name, "policy", PLAIN)
     return load_agent(name, scenario)
+
+
+def driver_of(others: str | Policy | None, scenario: Scenario) -> Policy:
+    """Return the policy of `load_agent`, for None `route_follower`, or straight on where that cannot drive.
+
+    Raises:
+        CoopenvError: it is no such driver, or cannot drive in this scenario.
+    """
+    if not (others is None or isinstance(others, str | Path) or callable(others) or hasattr(others, "predict")):
+        expected = "expected one agent for all other vehicles, a name, a folder, file.py:Class or a policy"
+        raise CoopenvError(f"others: {expected}, got {shown(others)}")
+    try:
+        return load_agent("route_follower" if others is None else others, scenario)
+    except CoopenvError:
+        if others is not None:
+            raise
+        return zero_policy(width=scenario.action_size)
 
 
 class ScriptedVehicles:

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from coopenv.api.terms.layout import RADIO, observation_layout
-from coopenv.policies.prediction import at_arc_lengths, discs_along, nearest, right_of_way
+from coopenv.policies.right_of_way import at_arc_lengths, discs_along, nearest, right_of_way
 from coopenv.scenario import Scenario
 
 MULTIPLES = np.array([1.0, 2.0, 4.0, 8.0])

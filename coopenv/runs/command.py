@@ -13,14 +13,16 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console, ConsoleOptions, RenderResult
 
 from coopenv.base.columns import WIDTH, Columns, Tabular, one_line, picture_html, terminal_html
-from coopenv.base.errors import CoopenvError, DataError, checked_seed, explained, listed
+from coopenv.base.errors import CoopenvError, DataError, explained, listed
 from coopenv.base.files import replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import install_command
+from coopenv.base.seeds import checked_seed
 from coopenv.base.terminal import Terminal, text_of
 from coopenv.episode import SCENE_FILE
 from coopenv.estimation.metrics import shown_note, shown_vehicles, steady_start
-from coopenv.estimation.observability import Observability, Trajectory, analyse_observability
+from coopenv.estimation.observability import Observability, analyse_observability
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import states_covariance, with_observer
 from coopenv.policies import Policy

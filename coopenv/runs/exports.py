@@ -19,8 +19,8 @@ from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import check_new, replace_text, replacing_folder, writing
 from coopenv.base.installation import environment, install_command, needing, version
 from coopenv.episode import Episode, Views
-from coopenv.estimation.observability import Trajectory
 from coopenv.estimation.poses import quaternion_wxyz
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.evaluation.episodes import play
 from coopenv.policies import Policy
 from coopenv.scenario import Scenario

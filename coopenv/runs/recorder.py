@@ -8,8 +8,9 @@ import numpy as np
 from coopenv.api.engine import Engine
 from coopenv.episode import RECORDED, Episode, Origin, Views
 from coopenv.evaluation.episodes import play
-from coopenv.observers.mailbox import Interference, interference_of, stacked
-from coopenv.observers.recording import MEASURED, Drawn, Recording, Sensed, Truth, is_due
+from coopenv.observers.faults import Interference, interference_of, stacked
+from coopenv.observers.recording import Drawn, Recording
+from coopenv.observers.sensed import MEASURED, Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
 from coopenv.scenario import ScenarioLike
 from coopenv.sources.base import Backend

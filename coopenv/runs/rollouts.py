@@ -16,8 +16,9 @@ from coopenv.base.installation import version
 from coopenv.episode import Episode, Views
 from coopenv.estimation import Outcome
 from coopenv.estimation.metrics import CONVERGED, mean_targets_in_view, observability_of, steady_mean, summarise
-from coopenv.estimation.observability import ConvergenceRates, Observability, Trajectory, convergence_rates, least_mean
+from coopenv.estimation.observability import ConvergenceRates, Observability, convergence_rates, least_mean
 from coopenv.estimation.poses import position_covariance, roll_pitch_yaw_deg
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.evaluation.episodes import estimated_here, play
 from coopenv.policies import Policy, load_policy
 from coopenv.runs.recorder import source_of

@@ -20,7 +20,7 @@ from coopenv.scenario.bodies import (
     Vehicle,
     WaypointMotion,
 )
-from coopenv.scenario.learning import PARAMETERS
+from coopenv.scenario.difficulty import PARAMETERS
 from coopenv.scenario.schema import Scenario, neighbour_sets
 from coopenv.scenario.sensing import Camera
 

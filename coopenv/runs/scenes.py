@@ -20,7 +20,7 @@ from coopenv.base.installation import install_command, list_envs
 from coopenv.episode import SCENE_FILE, Episode, Origin, Views
 from coopenv.evaluation.episodes import play
 from coopenv.observers.recording import Recording
-from coopenv.observers.registry import find, named, with_observer
+from coopenv.observers.registry import find, named, observer_of_robots, with_observer
 from coopenv.policies import Policy, agents_for, find_agent, load_policy
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.recorder import record_episode, source_of
@@ -187,13 +187,9 @@ def pages_can_be_written(path: Path, log: Console) -> bool:
     return there
 
 
-_ON_A_PLANE = "planar_robust"
-"""Observer of recorded robots unless another one is asked for."""
-
-
 def observer_of(recording: Recording) -> str:
     """Return the name of the observer of a recording where none is asked for."""
-    return _ON_A_PLANE if recording.scenario is None else recording.scenario.observer.name
+    return observer_of_robots() if recording.scenario is None else recording.scenario.observer.name
 
 
 def write_log(recording: Recording, path: Path, log: Console, observer: str | None = None, scene: bool = True) -> None:

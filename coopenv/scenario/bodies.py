@@ -22,7 +22,7 @@ from coopenv.base.sections import (
     Word,
     parsed,
 )
-from coopenv.scenario.learning import Dynamics
+from coopenv.scenario.dynamics import Dynamics
 from coopenv.scenario.sensing import Camera, Faults, Noise
 
 

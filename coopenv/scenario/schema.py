@@ -18,9 +18,12 @@ from coopenv.base.sections import Positive, Section, Text, Vector3, overlaid, va
 from coopenv.base.units import EPISODE, PLACE, TIME, warn_of_implausible
 from coopenv.scenario.bodies import MOST_LANDMARKS, Landmark, LandmarkGroup, Obstacle, Road, Vehicle
 from coopenv.scenario.cosimulators import COSIMULATORS, Cosimulator, Highway, Program, Sumo
-from coopenv.scenario.learning import Action, Difficulty, Dynamics, Observation, Randomisation, Reward, Termination
-from coopenv.scenario.routes import Boxes, Route, followers, overlapping_pairs, possible_boxes, start_of
-from coopenv.scenario.sensing import Camera, Faults, Images, Noise, ObserverSettings, Rates, Topology, V2x, rotation_of
+from coopenv.scenario.difficulty import Difficulty, Randomisation
+from coopenv.scenario.dynamics import Dynamics
+from coopenv.scenario.routes import Route, followers, start_of
+from coopenv.scenario.sensing import Camera, Faults, Images, Noise, ObserverSettings, Rates, Topology, V2x
+from coopenv.scenario.starts import check_room
+from coopenv.scenario.task import Action, Observation, Reward, Termination
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,10 +37,6 @@ MOST_PIXELS = 2**21  # of a rendered frame
 FAR_FROM_ORIGIN = 50.0
 """m; beyond it the paper's observer loses accuracy, because it is not invariant to the map origin."""
 
-SAME_PLACE = 1e-6  # m
-
-MOST_STARTS, MOST_CORNERS = 500_000, 1_000_000
-"""Boxes in which vehicles may start, and pairs of them that are compared for a warning."""
 
 READ = "coopenv.load_scenario reads one by name, from a file or from a dict"
 
@@ -277,7 +276,7 @@ class Scenario(Section, metaclass=_Loaded):
         for problem in (*_misplaced(self), *_problems(self)):
             raise ValueError(problem)
         if self.backend == "simulated":
-            _check_room(self)
+            check_room(self.vehicles, self.routes, self.obstacles)
         for doubt in _doubts(self, neighbours):
             warnings.warn(doubt, ScenarioWarning, stacklevel=2)
         return self
@@ -485,80 +484,6 @@ def agent_starts(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     routes = {route.name: route for route in scenario.routes}
     starts = [start_of(agent, routes) for agent in agents]
     return np.array([p for p, _ in starts]) - np.array(scenario.map.origin), np.array([R for _, R in starts])
-
-
-def _check_room(s: Scenario) -> None:
-    """Refuse (ValueError) vehicles that may start inside a building or in one another's place; warn of overlaps.
-
-    Vehicles with routes are drawn such that they do not touch, if they can: only those are named whose starts mostly
-    overlap.
-    """
-    routes = {route.name: route for route in s.routes}
-    equal: dict[Any, int] = {}
-    kinds: list[int] = []  # vehicles that start in the same boxes have one number
-    boxes, count = list[Boxes](), 0
-    for i, v in enumerate(s.vehicles):
-        kinds.append(equal.setdefault((v.routes, v.initial_pose, v.body, dict(v.motion).get("waypoints")), len(equal)))
-        if len(equal) > len(boxes):
-            boxes.append(possible_boxes(v, routes))
-            count += len(boxes[-1].half)
-        if count > MOST_STARTS:
-            raise ValueError(f"vehicles.{i}: routes and spreads up to this vehicle are over {MOST_STARTS:,} starts")
-    if s.obstacles:
-        walls = Boxes(
-            np.array([o.center for o in s.obstacles]),
-            np.array([rotation_of(o.yaw, None) for o in s.obstacles]),
-            np.array([o.size for o in s.obstacles]) / 2,
-        )
-        everywhere = Boxes(*(np.concatenate(parts) for parts in zip(*boxes, strict=True)))
-        whose = np.repeat(np.arange(len(boxes)), [len(part.half) for part in boxes])
-        for box, building in _pairs(everywhere, walls):
-            i, name = kinds.index(whose[box]), s.obstacles[building].name
-            raise ValueError(f"vehicles.{i}.initial_pose: vehicle_{i + 1} starts inside obstacle '{name}'")
-    fixed = [i for i, vehicle in enumerate(s.vehicles) if not vehicle.routes]
-    starts = np.array([start_of(s.vehicles[i], routes)[0] for i in fixed]).reshape(-1, 3)
-    points = Boxes(starts, np.tile(np.eye(3), (len(starts), 1, 1)), np.full_like(starts, SAME_PLACE / 2))
-    for second, first in _pairs(points, points):
-        raise ValueError(_in_place(s, fixed[second], fixed[first]))
-    for second, first in _overlapping_starts(s, boxes, kinds):
-        warnings.warn(f"{_in_place(s, second, first)}: their boxes overlap", ScenarioWarning, stacklevel=2)
-        return
-
-
-def _pairs(a: Boxes, b: Boxes) -> Iterator[list[int]]:
-    return (pair for block in overlapping_pairs(a, b) for pair in block.tolist())
-
-
-def _overlapping_starts(s: Scenario, boxes: Sequence[Boxes], kinds: Sequence[int]) -> Iterator[tuple[int, int]]:
-    """Yield vehicles whose nominal boxes overlap, with routes only if most of their possible boxes do.
-
-    Vehicles that wait for their entry have none. `boxes` are those of each kind of vehicle. The search is for a doubt
-    alone: it ends after `MOST_CORNERS`.
-    """
-    nominal = Boxes(*(np.array([boxes[kind][part][0] for kind in kinds]) for part in range(3)))
-    known: dict[tuple[int, int], bool] = {}
-    compared = 0
-    for i, j in _pairs(nominal, nominal):
-        one, other = s.vehicles[i], s.vehicles[j]
-        if one.routes or other.routes:
-            if one.entry or other.entry:
-                continue
-            key = kinds[i], kinds[j]
-            if key not in known:
-                a, b = boxes[key[0]], Boxes(*boxes[key[1]])  # a copy: all pairs of two vehicles of one kind
-                count = len(a.half) * len(b.half)
-                compared += count
-                if compared > MOST_CORNERS:
-                    return
-                known[key] = 2 * sum(map(len, overlapping_pairs(a, b))) > count
-            if not known[key]:
-                continue
-        yield i, j
-
-
-def _in_place(s: Scenario, second: int, first: int) -> str:
-    key = "routes" if s.vehicles[second].routes else "initial_pose"
-    return f"vehicles.{second}.{key}: vehicle_{second + 1} starts in the place of vehicle_{first + 1}"
 
 
 def neighbour_sets(scenario: Scenario) -> list[list[int]]:

@@ -307,14 +307,12 @@ GROUPS = tuple(FIELDS)
 """Groups of fields of coopenv, in their order in an observation."""
 USUAL_GROUPS = ("estimate", "quality", "bearings", "odometry", "messages", "goal")
 """Groups of a scenario that names none."""
-VALUES = "coopenv.api.terms.records"
-"""Module that computes the values of the built-in fields and reward terms, in the order of their rows."""
 
 OBSERVATION_FIELDS = Registry(
     "observation field",
     {
         name: ObservationField(
-            function=f"{VALUES}:{row[0]}_values", group=group, **dict(zip(COLUMNS, row, strict=False))
+            function=f"coopenv.api.terms.records:{row[0]}_values", group=group, **dict(zip(COLUMNS, row, strict=False))
         )
         for group, rows in FIELDS.items()
         for name, *row in rows
@@ -323,11 +321,11 @@ OBSERVATION_FIELDS = Registry(
 REWARD_TERMS = Registry(
     "reward term",
     {
-        name: Term(function=f"{VALUES}:reward_values", unit=unit, privileged=privileged, meaning=about)
+        name: Term(function="coopenv.api.terms.results:reward_values", unit=unit, privileged=privileged, meaning=about)
         for name, unit, privileged, about in REWARDS
     },
 )
 TERMINATION_CONDITIONS = Registry(
     "termination condition",
-    {name: Term(function=f"coopenv.world.dynamics:{place}", meaning=about) for name, place, about in CONDITIONS},
+    {name: Term(function=f"coopenv.world.referee:{place}", meaning=about) for name, place, about in CONDITIONS},
 )

@@ -12,21 +12,16 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from coopenv.observers.recording import MEASURED, Recording, Sensed, Truth
-from coopenv.scenario.learning import PARAMETERS
-from coopenv.world.camera import (
-    MISSED,
-    OUT_OF_VIEW,
-    VISIBLE,
-    camera_to_body,
-    marker_position,
-    sight_of,
-)
-from coopenv.world.dynamics import ARRIVED, COLLIDED, depart, move, referee, touches_anything
+from coopenv.observers.recording import Recording
+from coopenv.observers.sensed import MEASURED, Sensed, Truth
+from coopenv.scenario.difficulty import PARAMETERS
+from coopenv.world.camera import MISSED, OUT_OF_VIEW, VISIBLE, camera_to_body, marker_position, sight_of
+from coopenv.world.dynamics import move
 from coopenv.world.embedded import Source, arrange_world, look_around, sense_nothing
 from coopenv.world.model import Precision
 from coopenv.world.nearby import NOT_A_NEIGHBOUR, sort_into_cells
 from coopenv.world.odometry import measure_odometry
+from coopenv.world.referee import ARRIVED, COLLIDED, depart, referee, touches_anything
 from coopenv.world.reset import begin_sensing, place_bodies, set_initial_estimate
 from coopenv.world.route import UNDER_WAY
 from coopenv.world.state import allocate, array, fields

@@ -12,7 +12,7 @@ from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Road
 from coopenv.scenario.cosimulators import Highway
-from coopenv.scenario.learning import Dynamics
+from coopenv.scenario.dynamics import Dynamics
 from coopenv.sources.cosimulation import Moment, Poses, TrafficProgram
 from coopenv.world.dynamics import ACCELERATION, SPEED, STEERING
 

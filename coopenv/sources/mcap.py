@@ -20,7 +20,8 @@ from coopenv.base.plugins import loaded, offered
 from coopenv.base.sections import validated
 from coopenv.observers.arrays import ARRAYS, sizes_of
 from coopenv.observers.contract import Setup
-from coopenv.observers.recording import Recording, Truth, check_recording
+from coopenv.observers.recording import Recording, check_recording
+from coopenv.observers.sensed import Truth
 from coopenv.sources.mcap_format import (
     ATTACHMENT,
     CONTENTS,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +49,10 @@ class SourceKind:
     """Names for which the reader is."""
     comparison: str = ""
     """Its `coopenv.bench.observers.sources.RecordSource`, made of name, `data` and selection; empty: the usual one."""
+    variants: Mapping[str, str] = field(default_factory=dict)
+    """Variants of its records by name, each with its meaning; empty: those with faults."""
+    caveat: str = ""
+    """Note below tables of its records."""
     simulation: str = ""
     """Backend, made of the scenario, of environments whose key `sensing` is the name of the entry point."""
 
@@ -111,6 +115,11 @@ def kinds(asked: str = "") -> dict[str, SourceKind]:
             if name == asked:
                 raise
     return found
+
+
+def watched() -> list[str]:
+    """Return the names of kinds with the option `watch`, whose vehicles `coopenv view` observes and never drives."""
+    return [name for name, kind in kinds().items() if "watch" in kind.options]
 
 
 def live_kind(name: str, others: Mapping[str, SourceKind]) -> SourceKind:

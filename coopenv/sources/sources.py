@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 from coopenv.base.errors import CoopenvError, DataError, check_one_of
-from coopenv.base.plugins import call
-from coopenv.sources.registry import ENVIRONMENT, LOG, kind_of, kinds, live_kind
+from coopenv.base.plugins import call, offered
+from coopenv.sources.registry import ENVIRONMENT, GROUP, LOG, kind_of, kinds, live_kind
 from coopenv.sources.selection import WHOLE, Selection
 
 if TYPE_CHECKING:
@@ -116,8 +116,8 @@ def simulation_of(scenario: Scenario) -> Simulated:
         from coopenv.sources.cosimulation import Cosimulated
 
         return Cosimulated(scenario)
-    if scenario.sensing == "images":
-        made: Simulated = call(kinds()[scenario.sensing].simulation, scenario)
+    if scenario.sensing in offered(GROUP):
+        made: Simulated = call(kinds(scenario.sensing)[scenario.sensing].simulation, scenario)
         return made
     from coopenv.sources.worlds import Simulated
 

@@ -11,9 +11,9 @@ from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import exp_so3, exp_translation
 from coopenv.observers.contract import Message, ObserverInit
 from coopenv.observers.kernel_observer import views_of
-from coopenv.observers.recording import MEASURED, Sensed, check_tick, is_due
 from coopenv.observers.registry import find_embedded
 from coopenv.observers.runner import start_covariances
+from coopenv.observers.sensed import MEASURED, Sensed, check_tick, is_due
 from coopenv.sources.base import (
     Backend,
     Broadcasting,

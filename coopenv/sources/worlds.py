@@ -14,9 +14,10 @@ from coopenv.base.errors import CoopenvError, DataError, ScenarioWarning
 from coopenv.estimation import Sight
 from coopenv.observers.arrays import ARRAYS
 from coopenv.observers.contract import ObserverInit, sealed
-from coopenv.observers.recording import Recording, Sensed, Truth, check_recording, is_due, recorded_arrays
+from coopenv.observers.recording import Recording, check_recording, recorded_arrays
 from coopenv.observers.registry import find_embedded
 from coopenv.observers.runner import start_covariances
+from coopenv.observers.sensed import Sensed, Truth, is_due
 from coopenv.scenario import Scenario, parse_scenario
 from coopenv.scenario.files import override
 from coopenv.scenario.schema import neighbour_sets, processing_order

@@ -23,19 +23,21 @@ from stable_baselines3.common.logger import configure
 
 from coopenv.api.engine import Engine
 from coopenv.base import interrupts
-from coopenv.base.errors import CoopenvError, OutputError, evaluation_seed
+from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import check_file, new_folder, replacing_file, replacing_folder, writing
+from coopenv.base.seeds import evaluation_seed
 from coopenv.evaluation import Result, drive, held_out_seeds, ranking_key, score
 from coopenv.policies import Policy, load_agent
 from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE, check_agent
 from coopenv.policies.network import RightOfWay
 from coopenv.scenario import Scenario
 from coopenv.sources.sources import open_simulation
+from coopenv.training.batches import Arrays
 from coopenv.training.export import EXPORTED, check_onnx, export
 from coopenv.training.ranking import Figures, Ranking, figures_of
 from coopenv.training.sets import SetTrainer
 from coopenv.training.settings import TrainingPlan, check_settings, environment_file
-from coopenv.training.trainer import Arrays, DivergedError, Status, Trainer, tensors_of
+from coopenv.training.trainer import DivergedError, Status, Trainer, tensors_of
 
 NAMES = (*EXPORTED, CHECKPOINT_FILE, *CARD_FILES)
 """Names of files in an agent's folder; a card belongs to a single agent, and is removed with it."""

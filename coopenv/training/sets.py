@@ -11,8 +11,9 @@ from torch import nn
 from coopenv.base.errors import CoopenvError
 from coopenv.policies.sets import CONSTANTS, HEAD_LAYERS, LAYERS, METRES, SETS, SetDriver
 from coopenv.scenario import Scenario
+from coopenv.training.batches import APART
 from coopenv.training.settings import Clone, TrainingPlan
-from coopenv.training.trainer import APART, Status, regress, watch
+from coopenv.training.trainer import Status, regress, watch
 
 UNSEEN = 1e6
 """Standard deviation of an input that never changes in training: it has no effect."""

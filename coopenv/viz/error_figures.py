@@ -19,8 +19,9 @@ from coopenv.estimation.metrics import (
     settling_times,
     steady_mean,
 )
-from coopenv.estimation.observability import Observability, Trajectory
+from coopenv.estimation.observability import Observability
 from coopenv.estimation.poses import error_rotation, position_covariance, roll_pitch_yaw_deg
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.viz import style
 
 _ROW, _NARROW_ROW, _FRAME = 1.35, 0.95, 0.95  # inches

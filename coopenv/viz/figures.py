@@ -25,7 +25,8 @@ from coopenv.base.errors import check_one_of
 from coopenv.base.files import writing
 from coopenv.estimation import Sight
 from coopenv.estimation.metrics import STEADY_SHARE, live_ticks, mean_targets_in_view, shown_note, shown_vehicles
-from coopenv.estimation.observability import Observability, Trajectory, analyse_observability
+from coopenv.estimation.observability import Observability, analyse_observability
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.scenario import Scenario
 from coopenv.viz import FIGURE_NAMES
 from coopenv.viz import style as house

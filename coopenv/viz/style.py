@@ -23,7 +23,7 @@ from matplotlib.ticker import NullLocator
 from coopenv.base.columns import picture_html
 from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.base.files import replacing_file
-from coopenv.estimation.observability import Trajectory
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.viz import FORMATS
 
 # Okabe and Ito (2008), without the yellow that vanishes on white.

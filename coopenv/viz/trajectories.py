@@ -11,7 +11,7 @@ from mpl_toolkits.mplot3d import proj3d
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from coopenv.estimation.metrics import SETTLED, live_ticks, settling_times
-from coopenv.estimation.observability import Trajectory
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.scenario import Scenario
 from coopenv.viz import style
 from coopenv.viz.stage import Stage

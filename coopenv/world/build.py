@@ -13,21 +13,12 @@ from coopenv.estimation import KINDS, Outcome
 from coopenv.estimation.lens import largest_radius
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Vehicle
-from coopenv.scenario.learning import FASTEST_PACE, PARAMETERS, Dynamics
+from coopenv.scenario.difficulty import FASTEST_PACE, PARAMETERS
+from coopenv.scenario.dynamics import Dynamics
 from coopenv.scenario.routes import Signal, compile_motion, even_points, followers, point_count
 from coopenv.scenario.schema import agent_starts, neighbour_sets, processing_order
 from coopenv.scenario.sensing import Camera, Faults, Noise, Rates, rotation_of
-from coopenv.world.model import (
-    BLIND,
-    DRIVEN,
-    IDEAL,
-    PRESCRIBED,
-    SENSED,
-    STATIC,
-    Precision,
-    entry_struct,
-    model_struct,
-)
+from coopenv.world.model import BLIND, DRIVEN, IDEAL, PRESCRIBED, SENSED, STATIC, Precision, entry_struct, model_struct
 from coopenv.world.warp_internals import field_types, scalar_of
 
 NO_SIGNAL = Signal(at=0.0, period=1.0, green=1.0)

@@ -11,12 +11,14 @@ from typing import Any
 import warp as wp
 
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.poses import Coordinates, Rule
+from coopenv.estimation.poses import Coordinates
+from coopenv.estimation.validity import Rule
 from coopenv.world.camera import observe
-from coopenv.world.dynamics import depart, move, move_landmarks, referee
+from coopenv.world.dynamics import move, move_landmarks
 from coopenv.world.model import Precision
 from coopenv.world.nearby import sort_into_cells
 from coopenv.world.odometry import measure_odometry
+from coopenv.world.referee import depart, referee
 from coopenv.world.reset import begin_sensing, place_bodies
 from coopenv.world.route import appear, direct_traffic
 from coopenv.world.v2x import transmit
@@ -168,7 +170,7 @@ def send_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int, 
 
 
 HOST = Embedded("host", estimate_nothing, start_nothing, send_nothing)
-"""Placeholder for an observer that runs on the host (`coopenv.api.engine.PlugIns`)."""
+"""Placeholder for an observer that runs on the host (`coopenv.api.plugins.PlugIns`)."""
 
 
 @device_function

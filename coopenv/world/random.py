@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.scenario.learning import PARAMETERS
+from coopenv.scenario.difficulty import PARAMETERS
 
 vec4u = wp.types.vector(4, wp.uint32)
 

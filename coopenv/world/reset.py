@@ -9,7 +9,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import exp_so3, identity3, join6, orthonormalise
 from coopenv.world.camera import observe
-from coopenv.world.dynamics import command_of, prescribe, touches_anything, touches_one_of
+from coopenv.world.dynamics import command_of, prescribe
 from coopenv.world.model import DRIVEN, PRESCRIBED
 from coopenv.world.nearby import clear_cells, clear_entries, put_into_cell, sort_into_cells
 from coopenv.world.odometry import draw_errors
@@ -31,6 +31,7 @@ from coopenv.world.random import (
     uniform,
     unit_vector,
 )
+from coopenv.world.referee import touches_anything, touches_one_of
 from coopenv.world.route import direct_traffic, draw_route, go_straight, has_routes, start_on_route
 from coopenv.world.v2x import NOTHING, POSE_BYTES, draw_faults, first_tick_of, transmit
 

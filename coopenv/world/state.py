@@ -21,17 +21,9 @@ import warp as wp
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.sections import LARGEST
 from coopenv.estimation import Sight
-from coopenv.estimation.poses import (
-    Array,
-    Fields,
-    Mask,
-    Rule,
-    are_covariances,
-    are_rotations,
-    are_unit_vectors,
-    everywhere,
-)
-from coopenv.scenario.learning import MOST, PARAMETERS
+from coopenv.estimation.poses import Array
+from coopenv.estimation.validity import Fields, Mask, Rule, are_covariances, are_rotations, are_unit_vectors, everywhere
+from coopenv.scenario.difficulty import MOST, PARAMETERS
 from coopenv.world.model import Precision
 from coopenv.world.warp_internals import field_types, struct_of
 

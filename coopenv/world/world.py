@@ -10,9 +10,9 @@ import warp as wp
 
 from coopenv.base.errors import CoopenvError, ScenarioWarning, check_memory
 from coopenv.estimation import UNKNOWN, Sight
-from coopenv.estimation.poses import Rule
+from coopenv.estimation.validity import Rule
 from coopenv.scenario import Scenario
-from coopenv.scenario.learning import PARAMETERS
+from coopenv.scenario.difficulty import PARAMETERS
 from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
 from coopenv.world.launch import VEHICLES_PER_LEVEL, Call, Launcher, PerLane, PerWorld, threads_and_lanes
@@ -65,7 +65,7 @@ Options = Mapping[str, Any] | None
 class World:
     """`worlds` copies of one scenario, stepped together.
 
-    The draws of a world depend on its key alone (`coopenv.base.errors`): it is bit for bit the single world with that
+    The draws of a world depend on its key alone (`coopenv.base.seeds`): it is bit for bit the single world with that
     key (on the same device).
     """
 

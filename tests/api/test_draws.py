@@ -10,12 +10,12 @@ from pettingzoo.test import parallel_api_test
 
 from coopenv import CoopenvError
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
+from coopenv.api.single_vehicle import SingleVehicleEnv
 from coopenv.api.vector_env import CooperativeVectorEnv
-from coopenv.policies.single_vehicle import SingleVehicleEnv
 from coopenv.runs import Rollout
 from coopenv.runs.rollouts import outcome_line
 from coopenv.scenario import Scenario
-from coopenv.scenario.learning import PARAMETERS
+from coopenv.scenario.difficulty import PARAMETERS
 from tests.helpers.builders import constant, landmark, scenario, vehicle
 from tests.helpers.four_way import FOUR_WAY
 

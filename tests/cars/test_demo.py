@@ -33,7 +33,7 @@ from coopenv.cars.fake.lockstep import Hub
 from coopenv.cars.profile import SVEA, USUAL, Role
 from coopenv.cars.zenoh import open_zenoh
 from coopenv.cli.app import app
-from coopenv.estimation.observability import Trajectory
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.command import execute, report
 from coopenv.runs.rollouts import Rollout
 from coopenv.viz.trajectories import trajectory_figure_2d

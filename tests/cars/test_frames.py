@@ -14,7 +14,7 @@ import coopenv
 from coopenv import CoopenvError
 from coopenv.cars.frames import FrameRenderer, PlacedTag, facing
 from coopenv.cars.vision import Calibration, dictionary_of, opencv
-from coopenv.observers.recording import Sensed
+from coopenv.observers.sensed import Sensed
 from coopenv.scenario import Scenario, parse_scenario
 from coopenv.sources.base import Command
 from coopenv.sources.sources import simulation_of

@@ -21,8 +21,9 @@ from coopenv.estimation.metrics import (
     relative_error,
     wilson_interval,
 )
-from coopenv.estimation.observability import Trajectory, analyse_observability
+from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.poses import Coordinates
+from coopenv.estimation.trajectory import Trajectory
 from tests.helpers.synthetic import INITIAL_ERROR, RATE, make_trajectory
 
 unit_vectors = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-2)

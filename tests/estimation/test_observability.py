@@ -15,13 +15,8 @@ from scipy.linalg import eigvals
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import Sight
-from coopenv.estimation.observability import (
-    Trajectory,
-    analyse_observability,
-    convergence_rates,
-    least_mean,
-    slowest_decay,
-)
+from coopenv.estimation.observability import analyse_observability, convergence_rates, least_mean, slowest_decay
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.rollouts import rollout
 from coopenv.scenario import load_scenario
 from tests.helpers.env_suite import rest_slow

@@ -247,6 +247,9 @@ def test_a_vehicle_that_has_not_arrived_at_the_horizon_is_lost_for_the_rest_of_i
     collided = trips([0.1], np.array([False]), np.array([30]))
     nowhere = np.full_like(collided.route, np.nan)
     assert replace(collided, goal=np.zeros((1, 1), dtype=bool), route=nowhere).lost_for[0, 0] == 50  # of the episode
+    assert replace(collided, goal=np.zeros((1, 1), dtype=bool)).lost_for[0, 0] == 50  # its route ends nothing
+    once = replace(collided, arrivals=np.ones_like(collided.arrivals))
+    assert once.lost_for[0, 0] == 50  # on another way, after an arrival
     assert replace(collided, outcome=-collided.outcome).lost_for[0, 0] == 0  # never there
 
 

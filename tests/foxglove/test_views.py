@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.cli.app import main
 from coopenv.episode import Episode
-from coopenv.estimation.observability import Trajectory
 from coopenv.estimation.poses import Coordinates, covariance_in_map
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.observers.recording import Recording
 from coopenv.runs.recorder import record_episode
 from coopenv.scenario.sensing import Camera

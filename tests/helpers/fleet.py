@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.observers.recording import Sensed, Truth
+from coopenv.observers.sensed import Sensed, Truth
 from coopenv.scenario import Scenario
 from coopenv.sources.base import Capabilities, Command, Episode, TickGenerator
 from tests.helpers.builders import landmark, scenario, vehicle

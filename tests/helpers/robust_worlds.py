@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coopenv.api.engine import Engine
-from coopenv.base.errors import evaluation_seed
+from coopenv.base.seeds import evaluation_seed
 from coopenv.observers import Recording
 from coopenv.policies import decide, find_agent, restart
 from coopenv.runs.recorder import record

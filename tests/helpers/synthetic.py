@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import Sight
-from coopenv.estimation.observability import Trajectory
+from coopenv.estimation.trajectory import Trajectory
 
 LANDMARKS = np.array([(-4.0, 5.0, 3.0), (4.0, 4.0, 5.0), (4.0, -3.0, 4.0)])
 START = np.array([(-2, -16, 2.5), (-2, -19, 2), (-17, 2, 3), (-19, 2, 3.5), (-30, 2, 3)], float)

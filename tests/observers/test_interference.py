@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose
 
-from coopenv.base.errors import CoopenvError, world_keys
+from coopenv.base.errors import CoopenvError
+from coopenv.base.seeds import world_keys
 from coopenv.observers import Message, Recording, run
 from coopenv.observers.centralised import Centralised
 from coopenv.observers.contract import Tick, check_received

@@ -12,15 +12,8 @@ from coopenv import parallel_env
 from coopenv.api.terms.layout import observation_layout
 from coopenv.policies import act, load_agent
 from coopenv.policies.look_ahead import LookAhead, TeamLookAhead
-from coopenv.policies.prediction import (
-    FieldOfView,
-    Occluder,
-    Occluders,
-    PlanarCovariance,
-    discs_along,
-    nearest,
-    unhidden,
-)
+from coopenv.policies.prediction import FieldOfView, Occluder, Occluders, PlanarCovariance, unhidden
+from coopenv.policies.right_of_way import discs_along, nearest
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.policies.scripted import IntelligentDriver, Peek, StopWhenLost
 from coopenv.scenario import Scenario, load_scenario

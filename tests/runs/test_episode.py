@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from coopenv.episode import Episode
-from coopenv.estimation.observability import Trajectory
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.exports import STEPS, dataset_place, vehicle_episodes, write_dataset, write_tum
 from coopenv.runs.films import top_view_film, write_film
 from coopenv.runs.recorder import record_episode

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from coopenv.base import files
 from coopenv.cli.app import main
 from coopenv.estimation.metrics import absolute_error, relative_error
-from coopenv.estimation.observability import Trajectory
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.command import Results
 from coopenv.runs.exports import write_tum
 from tests.helpers.commands import refused

@@ -20,7 +20,8 @@ from coopenv.base.format import json_text
 from coopenv.cli.app import main
 from coopenv.estimation import Sight
 from coopenv.estimation.metrics import CONVERGED
-from coopenv.estimation.observability import Trajectory, analyse_observability
+from coopenv.estimation.observability import analyse_observability
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.policies import load_agent
 from coopenv.runs import Rollout, rollout
 from coopenv.runs.command import noise_note

@@ -19,7 +19,7 @@ from coopenv.base.columns import Columns
 from coopenv.base.installation import load_reference
 from coopenv.bench.cards import KINDS
 from coopenv.cli.app import main
-from coopenv.estimation.observability import Trajectory
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.command import Results
 from tests.helpers.four_way import FOUR_WAY
 

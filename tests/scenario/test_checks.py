@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from coopenv.base.errors import ScenarioError, ScenarioWarning
-from coopenv.scenario import Scenario, files, load_scenario, parse_scenario, routes, schema
+from coopenv.scenario import Scenario, files, load_scenario, parse_scenario, routes, starts
 from coopenv.scenario.bodies import with_groups
 from coopenv.scenario.schema import neighbour_sets, processing_order
 from tests.helpers import builders
@@ -262,7 +262,7 @@ def test_many_vehicles_on_equal_routes_are_compared_up_to_the_first_overlap(
 
 @pytest.mark.parametrize("most", ["MOST_CORNERS", "MOST_STARTS"])
 def test_comparisons_of_starts_have_a_limit(monkeypatch: pytest.MonkeyPatch, most: str) -> None:
-    monkeypatch.setattr(schema, most, 20)
+    monkeypatch.setattr(starts, most, 20)
     if most == "MOST_STARTS":
         with pytest.raises(
             ScenarioError, match=r"vehicles.1: routes and spreads up to this vehicle are over 20 starts"

@@ -13,10 +13,10 @@ import coopenv
 from coopenv.base.errors import CoopenvError, ScenarioWarning
 from coopenv.base.units import units_of
 from coopenv.scenario.files import load_scenario
-from coopenv.scenario.learning import RewardWeights
 from coopenv.scenario.scenes import SCENES
 from coopenv.scenario.schema import Scenario
 from coopenv.scenario.sites import Streets
+from coopenv.scenario.task import RewardWeights
 
 ROOT = Path(__file__).parents[2]
 LARGE = ["road:2,speed=50", "road:60,speed=50,lanes=1", "crossroad:40,speed=50", "lane:60"]

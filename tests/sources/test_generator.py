@@ -17,7 +17,8 @@ from coopenv import CoopenvError
 from coopenv.api.engine import Engine
 from coopenv.observers import Message, Received, register, registry, run
 from coopenv.observers.pose_filters import DeadReckoning
-from coopenv.observers.recording import Sensed, check_recording
+from coopenv.observers.recording import check_recording
+from coopenv.observers.sensed import Sensed
 from coopenv.policies import load_policy
 from coopenv.runs import record
 from coopenv.sources.base import VehicleBroadcast

@@ -18,7 +18,7 @@ from coopenv import DataError
 from coopenv.cli.app import main
 from coopenv.mrclam.recording import load_dataset, recording_of
 from coopenv.observers import Recording, run
-from coopenv.observers.recording import Truth
+from coopenv.observers.sensed import Truth
 from coopenv.sources.mcap import read_recording, write_recording
 from tests.helpers import mrclam_files
 from tests.helpers.four_way import FOUR_WAY

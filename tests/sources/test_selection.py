@@ -19,7 +19,8 @@ from coopenv.bench.observers import compare
 from coopenv.cars.bags.topic_map import load_map
 from coopenv.cli.app import main
 from coopenv.observers import Recording, run
-from coopenv.observers.recording import Truth, check_recording
+from coopenv.observers.recording import check_recording
+from coopenv.observers.sensed import Truth
 from coopenv.sources.mcap import write_recording
 from coopenv.sources.selection import Selection
 from coopenv.sources.sources import is_recording, open_recording

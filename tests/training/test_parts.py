@@ -21,10 +21,11 @@ from coopenv.policies import Policy, load_agent
 from coopenv.policies.network import Network, RightOfWay
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import REWARD_TERMS
+from coopenv.training.batches import LEAST_VARIANCE, NormalisedEnv
 from coopenv.training.command import train
 from coopenv.training.export import export, onnx_model
 from coopenv.training.settings import Clone, EvaluationSettings, Ppo, Settings, TrainingPlan, environment_file
-from coopenv.training.trainer import LEAST_VARIANCE, NormalisedEnv, Trainer, Watch
+from coopenv.training.trainer import Trainer, Watch
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.train

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from coopenv.estimation.observability import Trajectory
+from coopenv.estimation.trajectory import Trajectory
 from tests.helpers.synthetic import make_trajectory
 
 

@@ -19,7 +19,8 @@ from scipy.stats import chi2
 import coopenv
 from coopenv.estimation import Sight
 from coopenv.estimation.metrics import summarise
-from coopenv.estimation.observability import Trajectory, analyse_observability
+from coopenv.estimation.observability import analyse_observability
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.viz import FIGURE_NAMES, error_figures, style
 from coopenv.viz.error_figures import error_figure, observability_figure, unwrapped
 from coopenv.viz.figures import draw_figure, save_figures, topology_figure

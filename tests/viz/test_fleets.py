@@ -10,7 +10,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from coopenv.estimation.metrics import MOST_SHOWN, shown_note, shown_vehicles, summarise
-from coopenv.estimation.observability import Trajectory, analyse_observability
+from coopenv.estimation.observability import analyse_observability
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.command import Results
 from coopenv.viz import FIGURE_NAMES
 from coopenv.viz.figures import draw_figure, save_figures

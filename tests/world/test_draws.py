@@ -10,10 +10,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from coopenv.base.errors import evaluation_seed
+from coopenv.base.seeds import evaluation_seed
 from coopenv.estimation import Sight
 from coopenv.scenario import Scenario
-from coopenv.scenario.learning import PARAMETERS
+from coopenv.scenario.difficulty import PARAMETERS
 from tests.helpers.builders import constant, estimated_position, landmark, raw, reset, run, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES
 

@@ -15,7 +15,7 @@ from coopenv.world.camera import (
     project,
     segment_hits_box,
 )
-from coopenv.world.dynamics import ACCELERATION, ARRIVED, SPEED, STEERING
+from coopenv.world.dynamics import ACCELERATION, SPEED, STEERING
 from coopenv.world.model import DRIVEN
 from coopenv.world.nearby import (
     ROUNDING,
@@ -32,6 +32,7 @@ from coopenv.world.nearby import (
     sender_of,
 )
 from coopenv.world.quality import position_covariance
+from coopenv.world.referee import ARRIVED
 from coopenv.world.route import UNDER_WAY, goal_distance, place_on_route, point_on_route, route_length
 from coopenv.world.v2x import fresh
 from coopenv.world.warp_internals import device_function

@@ -10,7 +10,7 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed
 from coopenv.scenario import Scenario
-from coopenv.scenario.learning import Dynamics
+from coopenv.scenario.dynamics import Dynamics
 from coopenv.scenario.terms import GROUPS, OBSERVATION_FIELDS, SETTINGS, SETTINGS_OF_ACTIONS, ObservationField
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Records from which terms are computed, one vehicle at the end of a decision, and the values of the built-in terms.
+"""Records from which terms are computed, one vehicle at the end of a decision, and values of built-in fields.
 
 Numbers are float32 in worlds of either precision. A field of the observation takes `Ego`, and `Target`, `Neighbour` or
 `MapLandmark`. These depend on the truth only through measurements, received messages and actions. Only reward terms and
@@ -6,13 +6,12 @@ terminations may take `TruthRecord`, reward terms `FleetRecord` too, and are the
 cannot leak truth.
 
 Values stand in the order of their rows in `coopenv.scenario.terms`, and in their units; the results kernel scales and
-clips them, or weighs them.
+clips them.
 """
 
 import warp as wp
 
-from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
-from coopenv.world.dynamics import COLLIDED, OFF_ROUTE
+from coopenv.scenario.terms import OBSERVATION_FIELDS
 
 LOG10_E = wp.constant(0.4342944819032518)
 FORESIGHT = wp.constant(6.0)
@@ -149,7 +148,6 @@ for _name, _row in OBSERVATION_FIELDS.built_in.items():
 VehicleValues, TargetValues, NeighbourValues, LandmarkValues = (
     wp.types.vector(size, wp.float32) for size in _sizes.values()
 )
-RewardValues = wp.types.vector(len(REWARD_TERMS.built_in), wp.float32)
 
 
 @wp.func
@@ -276,36 +274,3 @@ def landmark_values(landmark: MapLandmark) -> LandmarkValues:
         wp.float32(landmark.expected),  # map_in_view
         landmark.age,  # map_age
     )  # fmt: skip
-
-
-@wp.func
-def per_metre(ego: Ego, excess: wp.float32, most: wp.float32):
-    """Return minus an excess in [0, most] for every metre gained, and `most` for every metre that is missed."""
-    paid = wp.where(excess < most, wp.max(excess, 0.0), most)  # NaN costs the most
-    return -(paid * ego.metres_gained + most * ego.metres_missed)
-
-
-@wp.func
-def reward_values(ego: Ego, truth: TruthRecord) -> RewardValues:
-    """Return the values of the reward terms, without weights."""
-    threshold, cap = ego.uncertainty_threshold, ego.uncertainty_cap
-    shortfall = ego.observability_level - ego.soft_observability
-    largest_shortfall = wp.max(ego.observability_level - ego.observability_floor, 0.0)
-    return RewardValues(
-        truth.progress,
-        wp.float32(ego.arrived),  # arrival
-        wp.where(ego.outcome == COLLIDED, -1.0, 0.0),  # collision
-        wp.where(ego.outcome == OFF_ROUTE, -1.0, 0.0),  # off_route
-        -ego.effort,  # control
-        -ego.elapsed,  # time
-        -0.001 * wp.float32(ego.bytes_sent),  # radio
-        -truth.position_error,
-        -(truth.orientation_error / DEGREES),
-        per_metre(ego, ego.position_std - threshold, cap),  # position_uncertainty
-        per_metre(ego, truth.position_error - threshold, cap),  # position_error_per_metre
-        ego.information_gained,  # information_gain
-        -ego.log_determinant / 6.0,  # uncertainty
-        log10(wp.max(ego.gramian_min_eigenvalue, EIGENVALUE_FLOOR)),  # observability
-        per_metre(ego, shortfall, largest_shortfall),  # observability_shortfall
-        wp.float32(ego.targets_in_view) / wp.float32(wp.max(ego.possible_targets, 1)),  # visibility
-    )

@@ -1,7 +1,8 @@
 """The results of a step: observation, reward, flags, quality of the estimate; one kernel per precision.
 
-The kernel computes the values of all built-in terms and reads from a table which of them an observation holds. User
-terms have kernels of their own (`own.py`), which read the records that this kernel writes for them.
+The kernel computes the values of all built-in terms and reads from a table which of them an observation holds. Reward
+terms stand in the order of their rows in `coopenv.scenario.terms`. User terms have kernels of their own (`own.py`),
+which read the records that this kernel writes for them.
 """
 
 from functools import cache
@@ -22,6 +23,7 @@ from coopenv.api.terms.geometry import (
 from coopenv.api.terms.layout import Layout, entries_of, included_fields
 from coopenv.api.terms.records import (
     DEGREES,
+    EIGENVALUE_FLOOR,
     SOURCES,
     Ego,
     MapLandmark,
@@ -29,8 +31,8 @@ from coopenv.api.terms.records import (
     Target,
     TruthRecord,
     landmark_values,
+    log10,
     neighbour_values,
-    reward_values,
     target_values,
     vehicle_values,
 )
@@ -47,6 +49,7 @@ from coopenv.world.quality import (
     position_variance,
     targets_in_view,
 )
+from coopenv.world.referee import COLLIDED, OFF_ROUTE
 from coopenv.world.route import UNDER_WAY, remaining_way
 from coopenv.world.state import FLAG, NUMBER, array, whole
 from coopenv.world.warp_internals import device_function
@@ -222,6 +225,42 @@ def is_over(model: Any, state: Any, world: int) -> bool:
         if state.ended[world, vehicle] == UNDER_WAY:
             return False
     return True
+
+
+RewardValues = wp.types.vector(len(REWARD_TERMS.built_in), wp.float32)
+
+
+@wp.func
+def per_metre(ego: Ego, excess: wp.float32, most: wp.float32):
+    """Return minus an excess in [0, most] for every metre gained, and `most` for every metre that is missed."""
+    paid = wp.where(excess < most, wp.max(excess, 0.0), most)  # NaN costs the most
+    return -(paid * ego.metres_gained + most * ego.metres_missed)
+
+
+@wp.func
+def reward_values(ego: Ego, truth: TruthRecord) -> RewardValues:
+    """Return the values of the reward terms, without weights."""
+    threshold, cap = ego.uncertainty_threshold, ego.uncertainty_cap
+    shortfall = ego.observability_level - ego.soft_observability
+    largest_shortfall = wp.max(ego.observability_level - ego.observability_floor, 0.0)
+    return RewardValues(
+        truth.progress,
+        wp.float32(ego.arrived),  # arrival
+        wp.where(ego.outcome == COLLIDED, -1.0, 0.0),  # collision
+        wp.where(ego.outcome == OFF_ROUTE, -1.0, 0.0),  # off_route
+        -ego.effort,  # control
+        -ego.elapsed,  # time
+        -0.001 * wp.float32(ego.bytes_sent),  # radio
+        -truth.position_error,
+        -(truth.orientation_error / DEGREES),
+        per_metre(ego, ego.position_std - threshold, cap),  # position_uncertainty
+        per_metre(ego, truth.position_error - threshold, cap),  # position_error_per_metre
+        ego.information_gained,  # information_gain
+        -ego.log_determinant / 6.0,  # uncertainty
+        log10(wp.max(ego.gramian_min_eigenvalue, EIGENVALUE_FLOOR)),  # observability
+        per_metre(ego, shortfall, largest_shortfall),  # observability_shortfall
+        wp.float32(ego.targets_in_view) / wp.float32(wp.max(ego.possible_targets, 1)),  # visibility
+    )
 
 
 @wp.func

@@ -20,8 +20,9 @@ from coopenv.api.engine import Engine
 from coopenv.api.make import make_vec
 from coopenv.api.terms.layout import Layout
 from coopenv.api.vector_env import CooperativeVectorEnv, RecordVehicleEpisodes
-from coopenv.base.errors import CoopenvError, checked_seed
+from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command
+from coopenv.base.seeds import checked_seed
 from coopenv.estimation import Outcome
 from coopenv.scenario import ScenarioLike
 

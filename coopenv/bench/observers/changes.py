@@ -19,7 +19,7 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets, processing_order
 
 if TYPE_CHECKING:
-    from coopenv.observers.mailbox import Interference
+    from coopenv.observers.faults import Interference
     from coopenv.observers.recording import Recording
 
 DIRECTION = np.array([0.6, 0.8, 0.0])
@@ -189,7 +189,7 @@ def _first_tick(recording: Recording, fault: Fault) -> int:
 
 def _interference(recording: Recording) -> Interference:
     """Return a copy of a recording's interference that may be written to; one without any fault if it has none."""
-    from coopenv.observers.mailbox import Interference
+    from coopenv.observers.faults import Interference
 
     K, N, L = recording.ticks, len(recording.setups), recording.landmarks.shape[1]
     return deepcopy(recording.interference) or Interference(

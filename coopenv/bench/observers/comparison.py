@@ -13,8 +13,9 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
 from coopenv.base.columns import Columns, Tabular, one_line, picture_html, terminal_html, written
-from coopenv.base.errors import CoopenvError, DataWarning, check_one_of, checked_seed, explained
+from coopenv.base.errors import CoopenvError, DataWarning, check_one_of, explained
 from coopenv.base.installation import names_of
+from coopenv.base.seeds import checked_seed
 from coopenv.base.terminal import Terminal, text_of
 from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables

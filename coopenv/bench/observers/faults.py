@@ -34,6 +34,7 @@ from coopenv.bench.observers.changes import (
 )
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.sensing import LONGEST_REPLAY
+from coopenv.sources.registry import kinds
 
 if TYPE_CHECKING:
     from coopenv.observers.recording import Recording
@@ -261,25 +262,14 @@ VARIANTS = {
 }
 """Variants with a name of their own."""
 
-ROBOT_VARIANTS = {
-    "landmarks": "no robot sees another",
-    "landmarks+robots": "everything that was seen counts",
-    "blind": "robots 3 to 5 see no landmark",
-}
-"""Variants of recorded robots, each with its meaning."""
-FRIENDLY = (
-    "Friendly: robots start at their true pose; who is seen is known from barcodes, "
-    "their own left out; the wheels' response was fitted to these robots; all receive from all, 10 Hz, no loss."
-)
-"""Note for reading tables of recorded robots."""
-
 
 def variant_rows() -> list[dict[str, str]]:
     """Return the rows of `list variants`."""
     named = {name: variant.summary for name, variant in VARIANTS.items()}
     faults = {f"{name}={kind.value}" if kind.value else name: kind.meaning for name, kind in FAULTS.items()}
-    kinds = {"environments, logs": named, "recorded robots": ROBOT_VARIANTS, "--fault": faults}
-    return [{"name": n, "of": of, "about": text} for of, variants in kinds.items() for n, text in variants.items()]
+    robots = {name: about for kind in kinds().values() for name, about in kind.variants.items()}
+    tables = {"environments, logs": named, "recorded robots": robots, "--fault": faults}
+    return [{"name": n, "of": of, "about": text} for of, variants in tables.items() for n, text in variants.items()]
 
 
 def with_world(variant: FaultVariant, scenario: Scenario) -> FaultVariant:

@@ -12,9 +12,10 @@ from coopenv.estimation.metrics import position_std
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Factory
 from coopenv.observers.correction import LARGEST
-from coopenv.observers.recording import PER_TICK, Recording, Truth
+from coopenv.observers.recording import PER_TICK, Recording
 from coopenv.observers.registry import find
 from coopenv.observers.runner import Run, run
+from coopenv.observers.sensed import Truth
 
 STRETCH, CHANGE = 1.5, 0.5  # s: the length of the changed records, and the latest time of their change
 BEFORE = 4  # usable frames before the change: a gate lets much of the first ones pass

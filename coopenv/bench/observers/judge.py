@@ -25,13 +25,15 @@ from coopenv.estimation.metrics import (
     relative_error,
     settling_time,
 )
-from coopenv.estimation.observability import RecordedGeometry, analyse_observability
+from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.poses import Array
+from coopenv.estimation.trajectory import RecordedGeometry
 from coopenv.observers.bound import Bound, cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Factory
 from coopenv.observers.isolation import started
-from coopenv.observers.recording import Recording, Truth
+from coopenv.observers.recording import Recording
 from coopenv.observers.runner import PLANAR_STATES, Run, run
+from coopenv.observers.sensed import Truth
 
 STEADY = "steady"
 
@@ -301,14 +303,14 @@ def horizontal_error(recording: Recording, result: Run) -> Array:
     return np.asarray(np.linalg.norm(offset, axis=-1))
 
 
-START = 1.0  # s; the largest error is judged after it, because the first estimates are drawn
+START = 1.0  # s; the first estimates are drawn, so until then an error counts only above that of the start
 
 
 def largest_after_start(t: Array, error: Array) -> Array:
-    """Return (N,) the largest of errors (K, N) after `START`; NaN where no error is known."""
-    after = error[t > START]
+    """Return (N,) the largest of errors (K, N) after `START`, or above the first error; NaN where none is known."""
+    counted = np.where((t > START)[:, None] | (error > error[0]), error, np.nan)
     return np.where(
-        np.isfinite(after).any(axis=0), np.nan_to_num(after, nan=-np.inf).max(axis=0, initial=-np.inf), np.nan
+        np.isfinite(counted).any(axis=0), np.nan_to_num(counted, nan=-np.inf).max(axis=0, initial=-np.inf), np.nan
     )
 
 

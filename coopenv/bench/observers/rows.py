@@ -132,7 +132,9 @@ class Row:
         f"share of seeds in which the errors never get below {DIVERGED_POSITION:g} m and {DIVERGED_ORIENTATION:g} deg, "
         "or exceed one of them again, and of those that failed"
     )
-    worst_after_start_m: float = _column(f"largest position error of all seeds after the first {START:g} s, m")
+    worst_after_start_m: float = _column(
+        f"largest position error of all seeds after {START:g} s, or above the first error, m"
+    )
     verdict: str = _column("consistent, overconfident or underconfident by anees_low and anees_high; or no covariance")
     finding: str = _column("mistakes of the observer in the first seed of the first variant, such as a wrong frame")
     ate_m: float = _column("absolute trajectory error over the whole run (evo's APE, nothing aligned), m")

@@ -20,7 +20,6 @@ from coopenv.base.plugins import call
 from coopenv.bench.observers.changes import NO_FOLLOWERS, leaders_of
 from coopenv.bench.observers.faults import (
     NOMINAL,
-    ROBOT_VARIANTS,
     VARIANTS,
     FaultVariant,
     check_recorded,
@@ -291,7 +290,7 @@ def find_source(
     folder, topic_map = (None if given is None else Path(given) for given in (data, topics))
     refused = {
         f"--policy {policy}: {text} is recorded, its vehicles cannot be driven": policy is not None,
-        f"--fault {next(iter(faults), '')}: recorded robots have variants of their own, {', '.join(ROBOT_VARIANTS)}": (
+        f"--fault {next(iter(faults), '')}: recorded robots have variants of their own, {', '.join(kind.variants)}": (
             kind.comparison and faults
         ),
         f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9": data and not kind.comparison,

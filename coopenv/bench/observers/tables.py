@@ -10,7 +10,7 @@ from rich.table import Table
 
 from coopenv.base.format import in_parentheses, number, with_error
 from coopenv.bench.observers.convergence import basin_failures, basin_table
-from coopenv.bench.observers.faults import FRIENDLY, NOMINAL, ROBOT_VARIANTS, VARIANTS
+from coopenv.bench.observers.faults import NOMINAL, VARIANTS
 from coopenv.bench.observers.judge import TimeWindow
 from coopenv.bench.observers.rows import (
     BOUNDS,
@@ -26,6 +26,7 @@ from coopenv.bench.observers.rows import (
 from coopenv.estimation.metrics import SETTLED, mean_or_nan
 from coopenv.estimation.poses import Array
 from coopenv.runs.console import number_table
+from coopenv.sources.registry import kinds
 
 FAILED = "failed"
 
@@ -132,8 +133,7 @@ def everything(board: Leaderboard, width: int = WIDTH) -> Iterator[Table | str]:
             yield ""
             yield levels
         yield from window_tables(board, variant, width)
-    if set(variants) <= set(ROBOT_VARIANTS):
-        yield f"\n{FRIENDLY}"
+    yield from (f"\n{kind.caveat}" for kind in kinds().values() if set(variants) <= set(kind.variants))
     if len(variants) > 1:
         yield ""
         yield variant_table(board, "mean RMSE [m]", "rmse", variants)

@@ -30,7 +30,7 @@ from coopenv.cars.transport import Arrival, Transport
 from coopenv.cars.vision import Calibration
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Message, sealed
-from coopenv.observers.recording import Sensed, Truth, is_due
+from coopenv.observers.sensed import Sensed, Truth, is_due
 
 FUTURE = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
 NS = 1e-9

@@ -32,7 +32,7 @@ from coopenv.cars.transport import ReceivingTransport, Transport
 from coopenv.cars.turning import TurnMonitor
 from coopenv.cars.zenoh import open_transport
 from coopenv.estimation.poses import left_covariance
-from coopenv.observers.recording import Sensed
+from coopenv.observers.sensed import Sensed
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.files import OVERRIDES
 from coopenv.sources.base import EPISODE_OVER, Capabilities, Command, Health, VehicleBroadcast

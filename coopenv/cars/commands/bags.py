@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cli import options
+from coopenv.cli import arguments, options
 from coopenv.cli.run import check_log
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from coopenv.cars.bags.topics import TopicRow
     from coopenv.cars.calibration import Calibrated, ConstantRow
 
-in_bags = partial(typer.Argument, metavar="BAG...", callback=options.existing("bag"))
+in_bags = partial(typer.Argument, metavar="BAG...", callback=arguments.existing("bag"))
 
 
 def import_(

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cli import options
+from coopenv.cli import arguments, commands, options
 
 if TYPE_CHECKING:
     from coopenv.cars.transport import Transport
 
-in_deployment = partial(typer.Argument, metavar="DEPLOYMENT.toml", callback=options.existing("deployment"))
+in_deployment = partial(typer.Argument, metavar="DEPLOYMENT.toml", callback=arguments.existing("deployment"))
 GateConnect = Annotated[
     str | None,
     typer.Option(
@@ -43,7 +43,7 @@ Station = Annotated[
     ),
 ]
 
-svea = options.group("SVEA cars, real ones and fakes.")
+svea = commands.group("SVEA cars, real ones and fakes.")
 HARMED = 1
 """Exit status of an attack that got through."""
 STOPPED = 3
@@ -445,7 +445,7 @@ class SveaRunOptions:
 
 
 @svea.command()
-@options.command
+@commands.command
 def run(given: SveaRunOptions) -> None:
     """Run an environment on cars: observers estimate, a policy drives, tables and figures follow.
 

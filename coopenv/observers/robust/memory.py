@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.base.sections import LARGEST
-from coopenv.estimation.poses import are_covariances
+from coopenv.estimation.validity import are_covariances
 from coopenv.observers.robust.constants import MAX_CORRELATIONS, MAX_HYPOTHESES, MAX_MEMBERS, STEPS
 from coopenv.world.state import COVARIANCE, FLAG, LEAST_EIGENVALUE, ROTATION, TICK, Rule, array, numbers, whole
 from coopenv.world.warp_internals import device_function

@@ -20,6 +20,7 @@ from coopenv.estimation.linalg import orthonormalise, sheared, skew, symmetric_p
 from coopenv.estimation.poses import Coordinates
 from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import KernelObserver
+from coopenv.observers.registry import observer_of_robots
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import (
     between,
@@ -415,6 +416,6 @@ def robust(setup: Setup) -> Observer:
     if setup.planar:
         raise CoopenvError(
             f"observer 'robust' is for vehicles in space; '{setup.name}' is a recorded robot on a plane whose odometry "
-            "is its commands: use 'planar_robust'"
+            f"is its commands: use '{observer_of_robots()}'"
         )
     return KernelObserver(ROBUST, setup)

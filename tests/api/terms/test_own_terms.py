@@ -17,7 +17,7 @@ from coopenv.base.errors import CoopenvError, ScenarioError
 from coopenv.base.installation import scenario_path
 from coopenv.cli.app import main
 from coopenv.estimation import Outcome
-from coopenv.estimation.observability import Trajectory
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.scenario.terms import REWARD_TERMS
 from tests.helpers.four_way import FOUR_WAY
 

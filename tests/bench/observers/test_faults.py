@@ -24,7 +24,7 @@ from coopenv.bench.observers.sources import SimulatedRecords, find_source, varia
 from coopenv.cli.app import main
 from coopenv.cli.bench import ObserverOptions
 from coopenv.observers import Message, Recording
-from coopenv.observers.mailbox import Interference, altered
+from coopenv.observers.faults import Interference, altered
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from coopenv.sources.mcap import write_recording

@@ -17,7 +17,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers import compare, judge
-from coopenv.bench.observers.judge import LEVEL_BINS, TimeWindow, level_measures, windows_of
+from coopenv.bench.observers.judge import (
+    LEVEL_BINS,
+    START,
+    TimeWindow,
+    largest_after_start,
+    level_measures,
+    windows_of,
+)
 from coopenv.bench.observers.rows import (
     EDGES,
     UNKNOWN,
@@ -92,9 +99,18 @@ def test_the_steady_window_is_the_leaderboard(found: coopenv.Comparison) -> None
 def test_the_worst_error_and_the_verdict_are_those_of_the_runs(found: coopenv.Comparison) -> None:
     scenario = coopenv.load_scenario("lane:4", SHORT)
     errors = np.array([run("mekf_covariance", record(scenario, seed)).position_error for seed in (0, 1, 2)])
-    late = found.groups["nominal", "mekf_covariance"][0].scene.windows[-1].end - 2.0  # START is 1 s of 3 s
-    after = errors[:, np.arange(errors.shape[1]) / 20.0 > late]
-    assert_allclose([row.worst_after_start_m for row in found.rows], after.max(axis=(0, 1)), rtol=1e-9)
+    late = np.arange(errors.shape[1]) / 20.0 > START
+    counted = np.where(late[:, None] | (errors > errors[:, :1]), errors, 0.0)
+    assert_allclose([row.worst_after_start_m for row in found.rows], counted.max(axis=(0, 1)), rtol=1e-9)
+
+
+def test_an_error_that_grows_at_the_start_counts_and_the_drawn_one_does_not() -> None:
+    t = np.array([0.0, 0.1, 0.2, START, 1.1, 1.2])
+    error = np.array([[5.0, 5.0, np.nan], [30.0, 4.0, np.nan], [3.0, 3.0, np.nan], *[[0.2, 0.3, np.nan]] * 3])
+    np.testing.assert_array_equal(largest_after_start(t, error), [30.0, 0.3, np.nan])
+
+
+def test_the_verdict_is_that_of_the_interval(found: coopenv.Comparison) -> None:
     for row in found.rows:
         word = "over" if row.anees > row.anees_high else "under"
         assert row.verdict == ("consistent" if row.anees_low <= row.anees <= row.anees_high else f"{word}confident")

@@ -20,7 +20,7 @@ from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, rea
 from coopenv.cars.transport import Arrival
 from coopenv.estimation.poses import exp_so3
 from coopenv.observers.contract import Message
-from coopenv.observers.recording import Sensed
+from coopenv.observers.sensed import Sensed
 from coopenv.scenario import Scenario
 from coopenv.sources.base import VehicleBroadcast
 from tests.helpers.builders import landmark, scenario, vehicle

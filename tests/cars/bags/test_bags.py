@@ -25,7 +25,7 @@ from coopenv.cars.bags.topics import regularity
 from coopenv.cars.source import BAG, DRIVE
 from coopenv.cli.app import main
 from coopenv.observers import Recording, run
-from coopenv.observers.recording import Sensed
+from coopenv.observers.sensed import Sensed
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from coopenv.sources.mcap import read_recording

@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import coopenv
-from coopenv.base.errors import world_keys
+from coopenv.base.seeds import world_keys
 from coopenv.estimation import linalg
 from coopenv.observers import riccati as kernels
 from coopenv.scenario import Scenario

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.bench.observers.convergence import random_start
 from coopenv.observers import Recording, run
-from coopenv.observers.recording import Truth
 from coopenv.observers.runner import Run
+from coopenv.observers.sensed import Truth
 from coopenv.scenario import load_scenario
 from tests.helpers.robust_worlds import noise_free, small_errors, watched
 

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 
 from benchmarks.evidence import CHANGES, STEP_AT, changed, road
 from coopenv.api.engine import Engine
-from coopenv.base.errors import world_keys
+from coopenv.base.seeds import world_keys
 from coopenv.observers import Recording
 from coopenv.observers.robust.constants import FAULT_GATE, FOUND_SHARE, MEAN_TIME, MONITOR_TIME, SHORT_TIME
 from coopenv.observers.robust.memory import ERRORS, LANDMARK_SLOTS, SENDER_SLOTS, SOURCES

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -12,28 +11,15 @@ import numpy as np
 
 from coopenv.api.make import parallel_env
 from coopenv.api.parallel_env import RENDER_MODES, CooperativeLocalisationEnv
-from coopenv.base.errors import CoopenvError, check_one_of, shown
-from coopenv.policies.base import Policy, decide, restart, zero_policy
-from coopenv.policies.loader import load_agent
-from coopenv.scenario import Scenario, ScenarioLike
+from coopenv.base.errors import CoopenvError, check_one_of
+from coopenv.base.installation import load_reference
+from coopenv.policies.base import Policy, decide, restart
+from coopenv.scenario import ScenarioLike
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
 
 MOST_EPISODES = 1000
-
-
-def driver_of(others: str | Policy | None, scenario: Scenario) -> Policy:
-    """Return the policy of `load_agent`, for None `route_follower`, or straight on where that cannot drive."""
-    if not (others is None or isinstance(others, str | Path) or callable(others) or hasattr(others, "predict")):
-        expected = "expected one agent for all other vehicles, a name, a folder, file.py:Class or a policy"
-        raise CoopenvError(f"others: {expected}, got {shown(others)}")
-    try:
-        return load_agent("route_follower" if others is None else others, scenario)
-    except CoopenvError:
-        if others is not None:
-            raise
-        return zero_policy(width=scenario.action_size)
 
 
 class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
@@ -66,7 +52,8 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         names, scenario = self.world.possible_agents, self.world.scenario
         self.vehicle = names[-1] if vehicle is None else vehicle
         check_one_of("unknown vehicle", self.vehicle, names)
-        self._others = driver_of(others, scenario)
+        driver_of = load_reference("coopenv.policies.loader:driver_of")  # policies stand on environments
+        self._others: Policy = driver_of(others, scenario)
         self.render_mode, self.scenario = self.world.render_mode, scenario
         self.metadata = dict(self.world.metadata)
         self.observation_space = self.world.observation_space(self.vehicle)
