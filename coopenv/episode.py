@@ -220,7 +220,7 @@ class Episode:
     rows: Mapping[str, Sequence[np.ndarray]]
     """Array of each tick by its name: of a `Frame`, and the others of `RECORDED`, which `scene.npz` does not hold."""
     recording: Recording | None = None
-    """What the vehicles measured at the K ticks, where it has been recorded."""
+    """Measurements of the vehicles at the K ticks, where they have been recorded."""
 
     def __len__(self) -> int:
         """Return K."""
