@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.base.sections import FAMILIES
-from coopenv.cars.frames import WALL, FrameRenderer, PlacedTag
-from coopenv.cars.vision import Calibration, find_tags
+from coopenv.cars.fake.frames import WALL, FrameRenderer, PlacedTag
+from coopenv.cars.messages.vision import Calibration, find_tags
 from coopenv.estimation.poses import Array
 from coopenv.runs.console import number_table
 

@@ -13,8 +13,8 @@ from coopenv.base.sections import Section
 from coopenv.bench.observers.rows import Row
 from coopenv.bench.pages import table
 from coopenv.cars.bags.topic_map import TopicMap
-from coopenv.cars.deployment import Deployment
-from coopenv.cars.profile import SVEA, CarProfile, Role
+from coopenv.cars.settings.deployment import Deployment
+from coopenv.cars.settings.profile import SVEA, CarProfile, Role
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from coopenv.training.settings import Settings
 

@@ -23,10 +23,17 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 # Containers often forbid byte code: each of hundreds of processes then compiles all the Python that it imports.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+
+from coopenv.estimation import compiled  # noqa: E402
+from coopenv.world import launch  # noqa: E402
+from tests.helpers.cpu_time import CpuTime  # noqa: E402
+
 gc.set_threshold(20_000, 20, 20)  # otherwise a tenth of the time goes into looking for unused objects
 
 MODULES_AT_MOST = 90
 """Warp modules that a run of the tests may compile: each costs a second or more with an empty cache."""
+LONGEST_COMPILATION = 1200.0
+"""s for which a worker waits for a module that another one compiles, before it compiles the module as well."""
 STARTED = time.time()
 COMPILED = pytest.StashKey[int]()
 DRAWS_WITHOUT_A_GRAPHICS_CARD = [
@@ -67,6 +74,15 @@ def browser() -> Iterator[Any]:
         started.close()
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Measure CPU time; let workers wait for one another's compilation, however slow a busy machine is."""
+    for module in (launch, compiled):
+        module.LONGEST_COMPILATION = LONGEST_COMPILATION
+    costs = CpuTime()
+    costs.measure_compilation()
+    config.pluginmanager.register(costs, "cpu_time")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip what runs SUMO where it is not installed: it is too large for `make test`."""
     if find_spec("libsumo") is None:
@@ -83,8 +99,6 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
     """Fail a run that compiled too many Warp modules; counted once, by the process that controls the workers."""
     if hasattr(session.config, "workerinput"):
         return
-    from coopenv.world import launch
-
     launch.start_warp()
     folders = [launch.cache_folder() / name for name in launch.modules()]
     compiled = sum(folder.stat().st_mtime > STARTED for folder in folders)

@@ -24,7 +24,7 @@ from coopenv import CoopenvError, load_scenario
 from coopenv.base.format import read_npz
 from coopenv.base.sections import read_toml
 from coopenv.cars.bags.topic_map import load_map
-from coopenv.cars.deployment import load_deployment
+from coopenv.cars.settings.deployment import load_deployment
 from coopenv.mrclam.dataset import load_dataset
 from coopenv.observers import Recording
 from coopenv.observers.contract import SensorNoise
@@ -228,7 +228,7 @@ def levels(n: int) -> str:
 
 
 def payload(n: int, folder: Path) -> Work:
-    codec = pytest.importorskip("coopenv.cars.codec", reason="needs the extra 'svea'")
+    codec = pytest.importorskip("coopenv.cars.messages.codec", reason="needs the extra 'svea'")
     one = "pixy_camera/msg/ObjectBearing"
     rows = [codec.make(one, id=i, bearing_x=1.0, bearing_y=0.0, bearing_z=0.0) for i in range(n)]
     kind = "pixy_camera/msg/ObjectBearingArrayStamped"
@@ -239,7 +239,7 @@ def payload(n: int, folder: Path) -> Work:
 def image(encoding: str) -> Callable[[int, Path], Work]:
     def make(n: int, folder: Path) -> Work:
         cv2 = pytest.importorskip("cv2", reason="needs the extra 'vision'")
-        from coopenv.cars.vision import frame_of
+        from coopenv.cars.messages.vision import frame_of
 
         if encoding == "mono8":
             fields = {"encoding": encoding, "width": 64, "height": n, "step": 64, "is_bigendian": 0}

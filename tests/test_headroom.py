@@ -148,7 +148,7 @@ def test_one_driver_drives_everywhere_like_its_planner(environment: str) -> None
 
 
 @pytest.mark.slow
-def test_it_drives_where_it_never_learnt() -> None:
+def test_the_general_driver_drives_in_an_unseen_environment() -> None:
     driver, lookout = (figures("large_crossing", agent, times=20) for agent in ("general", "peek"))
     assert driver["arrival_rate"][0] >= 0.9 and driver["e95_m"][0] <= 1.5 * lookout["e95_m"][0]
 
@@ -206,7 +206,7 @@ def test_errors_depend_on_what_is_sensed(environment: str) -> None:
 
 
 @pytest.mark.parametrize("environment", WORLDS)
-def test_sensing_is_all_that_the_dial_changes(environment: str) -> None:
+def test_the_key_sensing_changes_nothing_but_sensing(environment: str) -> None:
     """Under the same actions the truth is the same."""
     engines = [Engine(load_scenario(environment, {"sensing": how}), 4) for how in ("ideal", "sensed", "blind")]
     generator = np.random.default_rng(0)
@@ -232,7 +232,7 @@ def observations(environment: str, level: str, **options: object) -> np.ndarray:
 
 
 @pytest.mark.parametrize("environment", WORLDS)
-def test_a_level_is_said_in_the_file_or_at_a_reset(environment: str) -> None:
+def test_a_level_is_set_in_the_file_or_at_a_reset(environment: str) -> None:
     easy, hard = observations(environment, "easy"), observations(environment, "hard")
     assert (easy != hard).mean() > 0.1
     np.testing.assert_array_equal(hard, observations(environment, "", difficulty="hard"))
@@ -240,7 +240,7 @@ def test_a_level_is_said_in_the_file_or_at_a_reset(environment: str) -> None:
 
 
 @pytest.mark.parametrize("environment", WORLDS)
-def test_normal_is_what_the_file_says(environment: str) -> None:
+def test_the_level_normal_is_the_file(environment: str) -> None:
     scenario = load_scenario(environment)
     assert scenario.difficulty.neutral and scenario.difficulty.matters
     found = []
@@ -256,7 +256,7 @@ def test_normal_is_what_the_file_says(environment: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("environment", WORLDS)
 @pytest.mark.parametrize("agent", ["route_follower", "peek"])
-def test_what_is_harder_is_worse_known(environment: str, agent: str) -> None:
+def test_errors_grow_with_the_level(environment: str, agent: str) -> None:
     errors = []
     for level in ("easy", "hard"):
         scenario = load_scenario(environment, {"difficulty.level": level})

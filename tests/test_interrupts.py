@@ -66,7 +66,7 @@ def script(folder: Path, text: str) -> tuple[str, str, int]:
     return out, errors, process.returncode
 
 
-def test_what_does_not_end_is_ended(tmp_path: Path) -> None:
+def test_a_hanging_call_is_ended(tmp_path: Path) -> None:
     out, errors, status = script(
         tmp_path,
         "with files.replacing_folder('result', ['a']):\n"
@@ -78,7 +78,7 @@ def test_what_does_not_end_is_ended(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_who_swallows_the_interruption_is_ended(tmp_path: Path) -> None:
+def test_code_that_swallows_the_interruption_is_ended(tmp_path: Path) -> None:
     _, errors, status = script(
         tmp_path,
         "class Swallowing:\n"
@@ -109,7 +109,7 @@ def test_a_result_is_put_in_place_before_the_end(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["result"]
 
 
-def test_what_is_held_is_not_interrupted_without_a_signal() -> None:
+def test_held_code_is_not_interrupted_without_a_signal() -> None:
     with interrupts.held(), interrupts.held():
         pass
     assert not interrupts.received()

@@ -61,78 +61,53 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     [
         ([*EVALUATE, "acts.py:shape"], "the policy returned actions of shape (2, 5), expected (2, 2)"),
         ([*EVALUATE, "acts.py:nan"], "not finite for row 0"),
-        ([*EVALUATE, "acts.py:text"], "the policy returned no array of numbers, but 'left'"),
-        ([*EVALUATE, "acts.py:none"], "the policy returned actions of shape (), expected (2, 2)"),
         ([*EVALUATE, "acts.py:boom"], "the policy failed at acts.py:8: KeyError: 'inside'"),
         ([*EVALUATE, "acts.py:Reset"], "the policy's reset failed at acts.py:18: ValueError: bad reset"),
         ([*EVALUATE, "acts.py:Init"], "agent 'Init' cannot be built: ZeroDivisionError: no"),
         ([*EVALUATE, "acts.py:Leaves"], "agent 'Leaves' cannot be built: SystemExit: 3"),
         ([*EVALUATE, ","], "--agents ,: names no agent"),
         ([*EVALUATE, "peek", "--set", "camera.range=nan"], "camera.range: Input should be a finite number, got nan"),
-        ([*EVALUATE, "peek", "--out", "file"], "cannot write to file: it is not a folder"),
         ([*EVALUATE, "peek", "--worlds", "99999999999"], "Invalid value for '--worlds'"),
-        ([*WATCH, "acts.py:boom"], "the policy failed at acts.py:8"),
         ([*WATCH, "route_follower", "--out", "file"], "cannot write to file: it is not a folder"),
         (["watch", "route_follower", "--speed", "nan"], "Invalid value for '--speed'"),
         (["play", "facade", "--others", "nobody"], "unknown policy 'nobody'"),
-        (["page", "facade", "--out", "file"], "cannot write to file"),
         (["page", "facade", "busy_intersection", "--measure"], "there is nothing to drive"),
-        (["page", "raises.py"], "unknown environment 'raises.py'"),
         (["run", "facade", "--set", "seed=3"], "seed: unknown key; allowed: action, backend,"),
         (["bench", "observers", "overtaking", "--observers", ""], "unknown observer ''; known: "),
         (["bench", "observers", "overtaking", "--seeds", "1000", "--out", "file"], "cannot write to file"),
         (["bench", "observers", "overtaking", "--fault", ""], "fault '': expected [VEHICLE:]NAME"),
         ("run busy_intersecton", "did you mean 'busy_intersection'"),
-        ("run nowhere.toml", "no such scenario file: nowhere.toml"),
         ("run broken.toml", "not valid TOML"),
         ("run busy_intersection --steps 0", "--steps"),
         ("run busy_intersection --seed x", "--seed"),
-        ("run busy_intersection --seed -1", "--seed"),
         ("run busy_intersection --set foo", "expected KEY=VALUE"),
-        ("run busy_intersection --set =3", "expected KEY=VALUE"),
-        ("run busy_intersection --set noise.enabld=false", "did you mean 'enabled'"),
-        ("run busy_intersection --set horizon=nan", "horizon"),
-        ("run busy_intersection --set vehicles.9.goal=1", "no entry '9'"),
         ("run busy_intersection --dtype float16", "float16"),
-        ("run busy_intersection --device tpu", "tpu"),
         ("run urban_crossing --policy rando", "did you mean 'random'"),
-        ("run urban_crossing --agent rando", "did you mean 'random'"),
         ("run urban_crossing --observer mine.py", "mine.py: name a class or function in it: mine.py:Class"),
-        (
-            "run urban_crossing --horizon 5",
-            "No such option: --horizon; a key of the scenario: --override horizon=VALUE",
-        ),
+        ("run urban_crossing --horizon 5", "No such option: --horizon; a key of the scenario: --override"),
         ("run urban_crossing noise.enabled=false", "; a key of the scenario: --override noise.enabled=VALUE"),
         ("run facade.toml", "no such scenario file: facade.toml (did you mean 'facade'?)"),
         ("evaluate facade peek", "evaluate --help"),
         ("describe peek", "expected an environment, peek is an agent"),
-        ("run robust", "expected an environment, robust is an observer"),
         ("run busy_intersection --steady-from 50", "steady_from"),
         ("run busy_intersection --out file", "it is not a folder"),
-        ("run busy_intersection --out file/below", "cannot write to"),
         ("schema --out missing/schema.json", "cannot write to"),
         ("describe", "ENV"),
         ("list things", "things"),
         ("run ./rosbag", "rosbag: a ROS bag"),
-        ("describe picture.toml", "picture.toml: not a text file"),
         ("run busy_intersection --figures gif", "--figures"),
-        ("run nowhere.mcap", "nowhere.mcap"),
         ("run nowhere.mcap --seed 1", "no such log: nowhere.mcap"),
         ("run mrclam_6 --seed 1", "--seed: is for a simulation, mrclam_6 is recorded"),
         ("run busy_intersection --variant blind", "is for recorded data"),
-        ("run busy_intersection --bogus", "--bogus"),
-        ("frobnicate", "frobnicate"),
         ("record mrclam_6 --seed 2 --out drive.mcap", "--seed: is for a simulation, mrclam_6 is recorded"),
         ("record mrclam_12 --data . --out drive.mcap", "unknown data set 'mrclam_12' (did you mean"),
-        ("record mrclam_6 --variant blnd --data . --out drive.mcap", "did you mean 'blind'"),
         ("record busy_intersection --variant blind --out drive.mcap", "variant is for recorded data"),
         ("record busy_intersection --data . --out drive.mcap", "data is for recorded data"),
-        ("record busy_intersectoin --out drive.mcap", "did you mean 'busy_intersection'"),
         ("record busy_intersection --out drive.bag", "the name must end in .mcap"),
         ("record busy_intersection --out none/drive.mcap", "folder none does not exist"),
     ],
 )
-def test_one_line_and_nothing_is_left(
+def test_a_mistake_is_one_line_and_nothing_is_left(
     arguments: list[str] | str, words: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     there = sorted(folder.rglob("*"))
@@ -160,56 +135,40 @@ def test_a_bag_that_does_not_exist_is_an_error(command: str, name: str, capsys: 
     assert f"no such bag: {name}" in error_text and "map" not in error_text and error_text.count("\n") == 1
 
 
-@pytest.mark.parametrize("arguments", [["list"], ["schema"], ["--help"]])
-def test_a_full_disk_is_one_line(arguments: list[str], tmp_path: Path) -> None:
+def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
-        process = start((*COOPENV, *arguments), tmp_path, stdout=full)
+        process = start((*COOPENV, "list"), tmp_path, stdout=full)
         _, errors = process.communicate(timeout=DEADLOCK)
     assert (errors, process.returncode) == ("error: standard output: No space left on device\n", 2)
 
 
-@pytest.mark.parametrize("arguments", [["list"], ["schema"], ["--version"]])
-def test_a_closed_pipe_is_quiet(arguments: list[str], tmp_path: Path) -> None:
+def test_a_closed_pipe_is_quiet(tmp_path: Path) -> None:
     reader = start(("true",), tmp_path, stdin=subprocess.PIPE)
     reader.wait()
-    process = start((*COOPENV, *arguments), tmp_path, stdout=reader.stdin)
+    process = start((*COOPENV, "schema"), tmp_path, stdout=reader.stdin)
     _, errors = process.communicate(timeout=DEADLOCK)
     assert (errors, process.returncode) == ("", 141)
 
 
-def test_results_are_kept_when_the_table_cannot_be_printed(tmp_path: Path) -> None:
-    with Path("/dev/full").open("w") as full:
-        command = (*COOPENV, "run", "overtaking", "--steps", "1", "--no-figures", "--out", "x")
-        process = start(command, tmp_path, stdout=full)
-        process.communicate(timeout=DEADLOCK)
-    assert process.returncode == 2
-    assert (tmp_path / "x" / "metrics.json").is_file()
+def test_results_are_kept_when_the_table_cannot_be_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full(io.StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(sys, "stdout", Full())
+    assert main(["run", "overtaking", "--steps", "1", "--no-figures", "--out", "x"]) == 2
+    assert Path("x/metrics.json").is_file()
 
 
 def test_without_any_standard_stream(tmp_path: Path) -> None:
     closed = ("bash", "-c", 'exec "$@" <&- >&- 2>&-', "bash")
-    for arguments, status in ((["list"], 0), (["nothing"], 2), (["schema", "--out", "s.json"], 0)):
-        assert start((*closed, *COOPENV, *arguments), tmp_path).wait(DEADLOCK) == status
+    assert start((*closed, *COOPENV, "schema", "--out", "s.json"), tmp_path).wait(DEADLOCK) == 0
     assert (tmp_path / "s.json").read_text().startswith("{")
 
 
 def test_a_full_disk_for_errors_changes_no_status(tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
         assert start((*COOPENV, "run", "nowhere"), tmp_path, stderr=full).wait(DEADLOCK) == 2
-
-
-def test_names_that_are_no_text_are_printed(tmp_path: Path) -> None:
-    strict = ("env", "PYTHONIOENCODING=ascii:strict")
-    process = start((*strict, *COOPENV, "schema", "--out", "none\udcff/s.json"), tmp_path)
-    _, errors = process.communicate(timeout=DEADLOCK)
-    assert process.returncode == 2
-    assert errors == "error: cannot write to none\\udcff/s.json: folder none\\udcff does not exist\n"
-
-
-def test_a_terminal_without_width_still_shows_tables(tmp_path: Path) -> None:
-    process = start(("env", "COLUMNS=0", *COOPENV, "list"), tmp_path)
-    out, _ = process.communicate(timeout=DEADLOCK)
-    assert "busy_intersection" in out
 
 
 WITHOUT = """
@@ -251,12 +210,7 @@ COMMANDS = {
     "view crossing_path": "view",
     "film crossing_path --out film.mp4": "video",
     "run recorded.mcap": "log",
-    "describe recorded.mcap": "log",
-    "film recorded.mcap --out film.gif": "log",
-    "run drive.bag --map topics.toml": "log",
     "import drive.bag": "log",
-    "record crossing_path --out new.mcap": "log",
-    "bench observers recorded.mcap": "log",
     "train facade --out agent": "train",
     "dataset facade": "minari",
     "describe highway_intersection": "highway",
@@ -264,11 +218,7 @@ COMMANDS = {
     "bench observers overtaking --observers factor_graph": "bench",
     "bench observers overtaking --engine ray": "ray",
     "svea demo": "svea",
-    "svea router": "svea",
-    f"svea fake {FLEET} --car svea7": "svea",
     f"svea run {FLEET}": "svea",
-    f"svea keys {FLEET} --out keys": "svea",
-    f"svea health {FLEET} --car svea7": "svea",
 }
 """Command to the extra that it needs."""
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import coopenv
-from coopenv.cars.profile import SVEA
+from coopenv.cars.settings.profile import SVEA
 from coopenv.cli.app import main
 from coopenv.policies import load_agent
 from tests.helpers.processes import DEADLOCK, ROOT, mentioning, start

@@ -14,15 +14,16 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from coopenv.cars import codec
 from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
-from coopenv.cars.deployment import load_deployment
 from coopenv.cars.fake.car import Fake
 from coopenv.cars.fake.settings import fake_fault
-from coopenv.cars.gate import GateClock, write_drive
-from coopenv.cars.profile import MotionCommand, Role
-from coopenv.cars.transport import Arrival, matcher
+from coopenv.cars.gate.gate import GateClock
+from coopenv.cars.gate.wheel_command import MotionCommand, write_drive
+from coopenv.cars.link.transport import Arrival, matcher
+from coopenv.cars.messages import codec
+from coopenv.cars.settings.deployment import load_deployment
+from coopenv.cars.settings.profile import Role
 
 FLEET = Path(__file__).parents[1] / "fleet" / "overtaking.toml"
 KEPT = (Role.DETECTIONS, Role.CAMERA_INFO, Role.WHEEL, Role.IMU, Role.TRUTH, Role.MANUAL)

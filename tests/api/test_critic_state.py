@@ -22,7 +22,7 @@ def drive(env: Any, steps: int) -> Any:
 
 
 @pytest.mark.parametrize("name", ["open_square", FOUR_WAY])
-def test_it_holds_the_values_of_infos(name: str) -> None:
+def test_the_state_holds_the_values_of_infos(name: str) -> None:
     env = coopenv.parallel_env(name)
     observations, infos = drive(env, 12)
     scales, state = env.scenario.observation, env.state()
@@ -63,7 +63,7 @@ def test_worlds_of_a_batch(name: str) -> None:
         assert_array_equal(env.state(), state)
 
 
-def test_what_it_adds_to_observations_varies() -> None:
+def test_values_beyond_observations_vary() -> None:
     """Over worlds and times: truth, errors and ways of every vehicle, and the positions of drawn landmarks."""
     batch = coopenv.make_vec("open_square", num_worlds=24)
     batch.reset(seed=0)

@@ -57,7 +57,7 @@ def test_estimates_that_are_the_truth_are_observed_as_such(kind: Any, scenario: 
         assert len(sensed[-1]["connected"]) == 2
 
 
-def test_the_agent_is_observed_where_it_believes_itself_to_be() -> None:
+def test_the_agent_is_observed_at_its_estimate() -> None:
     env, plain = wrapped(), IntersectionEnv()
     for sensed, true in zip(episode(env, 5), episode(plain, 5), strict=True):
         reported = sensed[-1]["localisation"]
@@ -68,7 +68,7 @@ def test_the_agent_is_observed_where_it_believes_itself_to_be() -> None:
         assert np.linalg.eigvalsh(reported["position_covariance"]).min() > 0.0
 
 
-def test_nothing_really_moves_where_it_is_believed_to_be() -> None:
+def test_estimates_do_not_move_the_truth() -> None:
     env, plain = wrapped(sensing="blind"), IntersectionEnv()
     episode(env, 5)
     episode(plain, 5)
@@ -106,7 +106,7 @@ def test_there_may_be_more_traffic_than_the_scenario_expects() -> None:
     assert all(np.isfinite(step[-1]["localisation"]["position_error"]) for step in record)
 
 
-def test_its_own_control_may_act_on_the_estimate() -> None:
+def test_lane_keeping_may_act_on_the_estimate() -> None:
     aside = {}
     for lane_keeping in (False, True):
         env = wrapped(sensing="blind", lane_keeping=lane_keeping)
@@ -124,7 +124,7 @@ def test_any_observer_and_any_observation(observer: str) -> None:
     assert last[-1]["localisation"]["position_error"] < 1.0
 
 
-def test_it_is_an_environment_of_gymnasium() -> None:
+def test_the_wrapper_passes_the_check_of_gymnasium() -> None:
     check_env(wrapped(), skip_render_check=True)
     env, other = wrapped(), wrapped()
     first = episode(env, 7, 4)
@@ -143,6 +143,6 @@ def test_it_is_an_environment_of_gymnasium() -> None:
         (lambda: wrapped(MultiAgentIntersectionEnv).reset(), "takes environments with one agent, this one has 2"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(make: Any, why: str) -> None:
+def test_mistakes_are_one_line(make: Any, why: str) -> None:
     with pytest.raises(CoopenvError, match=why):
         make()

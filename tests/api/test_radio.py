@@ -31,7 +31,7 @@ def driven(name: str, entries: np.ndarray | None, steps: int = 40, **more: objec
     return engine
 
 
-def test_what_is_sent_to_all_is_what_is_broadcast_otherwise() -> None:
+def test_reports_sent_to_all_equal_broadcasts() -> None:
     broadcast, chosen = driven("scout_platoon", None), driven("scout_platoon", np.full((3, 2), REPORT))
     for name in ("position", "estimate_position", "covariance", "inbox_tick", "inbox_position"):
         assert np.array_equal(broadcast.view(name), chosen.view(name)), name

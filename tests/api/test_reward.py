@@ -30,7 +30,7 @@ def minus_error(step: Step) -> Any:
     return -step["position_error"]
 
 
-def test_it_replaces_the_reward_of_one_world_and_only_that() -> None:
+def test_a_function_replaces_the_reward_of_one_world_alone() -> None:
     plain = coopenv.parallel_env(FOUR_WAY, overrides=SHORT)
     own = pickle.loads(pickle.dumps(coopenv.parallel_env(FOUR_WAY, overrides=SHORT, reward=minus_error)))
     starts = [env.reset(seed=2) for env in (plain, own)]
@@ -46,7 +46,7 @@ def test_it_replaces_the_reward_of_one_world_and_only_that() -> None:
 
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step", "disabled"])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_a_batch_earns_what_the_function_says_where_it_is_alive(autoreset: str, dtype: str) -> None:
+def test_vehicles_under_way_earn_the_value_of_the_function(autoreset: str, dtype: str) -> None:
     calls = []
 
     def reward(step: Step) -> np.ndarray:
@@ -88,7 +88,7 @@ def test_gymnasium_hands_it_on() -> None:
     assert (rows.step(np.zeros((4, 2), np.float32))[1] == 7.0).all()
 
 
-def test_a_step_is_the_infos_of_everybody() -> None:
+def test_a_step_has_the_infos_of_all_vehicles() -> None:
     steps: list[dict[str, Any]] = []
 
     def keep(step: Step) -> np.ndarray:
@@ -114,7 +114,7 @@ def test_a_step_is_the_infos_of_everybody() -> None:
         assert step["action"][0, i].tolist() == [0.25, -1.0]
 
 
-def test_nobody_writes_into_the_world() -> None:
+def test_a_step_is_read_only() -> None:
     def careless(step: Step) -> np.ndarray:
         error: np.ndarray = step["position_error"]
         error *= -1.0
@@ -129,14 +129,8 @@ def test_nobody_writes_into_the_world() -> None:
 @pytest.mark.parametrize(
     ("reward", "message"),
     [
-        (
-            lambda step: step["positon_error"],
-            "a step has no 'positon_error' .did you mean 'position_error'.*known: obs",
-        ),
-        (
-            lambda step: step["position_error"][0],
-            r"returned shape \(4,\) .* expected numbers of shape \(2, 4\), worlds x",
-        ),
+        (lambda step: step["positon_error"], "a step has no 'positon_error' .did you mean 'position_error'.*known"),
+        (lambda step: step["position_error"][0], r"returned shape \(4,\) .* expected numbers of shape \(2, 4\)"),
         (lambda step: 1.0, r"returned shape \(\)"),
         (lambda step: None, "returned shape .* and dtype object"),
         (lambda step: np.full((2, 4), "a"), "and dtype <U1"),
@@ -154,7 +148,7 @@ def test_mistakes_are_one_line(reward: Any, message: str) -> None:
     assert str(caught.value).isprintable()
 
 
-def test_what_is_no_function_is_refused_and_a_gpu_has_no_arrays_for_one() -> None:
+def test_objects_that_are_no_functions_and_devices_without_arrays_are_refused() -> None:
     with pytest.raises(CoopenvError, match="reward: expected a function of a step, got 'mine'"):
         coopenv.parallel_env("crossing_path", reward="mine")  # type: ignore[arg-type]
     check_function(None, "cuda:0")

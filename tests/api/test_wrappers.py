@@ -22,7 +22,6 @@ from tests.helpers.env_suite import first_episodes
 from tests.helpers.four_way import FOUR_WAY
 
 CROSSING = "coopenv/UrbanCrossing-v0"
-SHORT = {"horizon": 3.0}
 
 
 def batch(**options: Any) -> coopenv.CooperativeVectorEnv:
@@ -59,7 +58,7 @@ def test_time_aware_observation_knows_the_horizon() -> None:
 
 
 @pytest.mark.parametrize("horizon", [1.05, 1.25])  # in the midst of a decision
-def test_the_spec_says_how_long_an_episode_is(horizon: float) -> None:
+def test_the_spec_has_the_length_of_an_episode(horizon: float) -> None:
     def never(observations: np.ndarray) -> np.ndarray:
         raise AssertionError("nobody else is here")
 
@@ -121,19 +120,6 @@ def test_make_vec_by_name() -> None:
         gymnasium.make_vec(CROSSING, num_envs=9)
 
 
-def test_normalize_observation() -> None:
-    env = wrappers.NormalizeObservation(batch())
-    env.reset(seed=0)
-    env.action_space.seed(0)
-    observations = np.stack([env.step(env.action_space.sample())[0] for _ in range(60)])
-    assert observations.dtype == np.float32
-    assert np.isfinite(observations).all()
-    assert abs(observations[20:].mean()) < 0.5
-    for mode in ("same_step", "disabled"):  # Gymnasium's wrapper allows next_step alone
-        with pytest.raises((ValueError, AssertionError)):
-            wrappers.NormalizeObservation(batch(autoreset=mode))
-
-
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step", "disabled"])
 def test_action_and_observation_wrappers(autoreset: str) -> None:
     env = wrappers.RescaleAction(batch(autoreset=autoreset), np.float32(0.0), np.float32(1.0))
@@ -146,17 +132,6 @@ def test_action_and_observation_wrappers(autoreset: str) -> None:
         first, second = env.step((actions + 1.0) / 2.0), twin.step(actions)
         assert np.allclose(first[0], second[0], atol=1e-5)
         assert np.allclose(first[1], second[1], atol=1e-5)
-
-
-def test_partial_reset_under_statistics() -> None:
-    env = wrappers.RecordEpisodeStatistics(batch(autoreset="disabled", overrides={"horizon": 0.5}))
-    env.reset(seed=0)
-    for _ in range(5):
-        _, _, terminated, truncated, _ = env.step(np.zeros((env.num_envs, 2), dtype=np.float32))
-    assert (terminated | truncated).all()
-    mask = np.repeat([True, False, True], 4)
-    env.reset(options={"reset_mask": mask})
-    assert (env.episode_lengths == np.where(mask, 0, 5)).all()
 
 
 @pytest.mark.filterwarnings("ignore:.*Overwriting existing videos")

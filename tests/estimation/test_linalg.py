@@ -281,7 +281,7 @@ def test_damaged_machine_code_is_made_anew(tmp_path: Path, monkeypatch: pytest.M
             path.write_bytes(path.read_bytes()[:20])
 
 
-def test_one_process_compiles_and_none_waits_for_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_process_compiles_and_none_waits_for_cached_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     locked: list[Path] = []
     monkeypatch.setattr(compiled, "code_folder", lambda: tmp_path)
     monkeypatch.setattr(compiled, "lock", lambda folder, wait: locked.append(folder))

@@ -195,7 +195,7 @@ def test_arguments_stay_as_they_are() -> None:
     assert_allclose(b, [1.0, 2.0])
 
 
-def test_what_has_no_answer_is_refused() -> None:
+def test_singular_input_is_refused() -> None:
     with pytest.raises(np.linalg.LinAlgError):
         cholesky(np.diag([1.0, -1.0]))
     with pytest.raises(np.linalg.LinAlgError):

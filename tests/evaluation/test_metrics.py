@@ -44,7 +44,7 @@ def test_a_world_of_the_batch_is_that_world_alone(episodes: Episodes) -> None:
     np.testing.assert_allclose(np.exp(1j * episodes.heading[:K, 4]), np.exp(1j * heading[:K]), atol=1e-4)
 
 
-def test_figures_by_hand(episodes: Episodes) -> None:
+def test_figures_against_their_definitions(episodes: Episodes) -> None:
     found = {result.metric: result for result in score(episodes)}
     assert list(found) == list(METRICS)
     counted = episodes.under_way & (episodes.time >= 3.0)[:, None, None]
@@ -81,7 +81,7 @@ def test_paired_differences(episodes: Episodes) -> None:
     assert (same.difference, same.ci_low, same.ci_high) == (0.0, 0.0, 0.0)
 
 
-def test_travel_times_are_compared_over_those_who_arrive_with_both(episodes: Episodes) -> None:
+def test_travel_times_are_compared_over_vehicles_that_arrive_with_both(episodes: Episodes) -> None:
     slowest = episodes.travel_time == np.nanmax(episodes.travel_time)
     fewer = replace(episodes, arrivals=np.where(slowest, 0, episodes.arrivals))
     difference = next(d for d in compare_paired(fewer, episodes) if d.metric == "travel_time_s")

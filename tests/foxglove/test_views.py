@@ -248,7 +248,7 @@ def test_distortion_moves_the_targets() -> None:
     assert np.linalg.norm(bent[0] - straight[0]) > 4.0
 
 
-def test_what_is_shown_costs_little(crossing: Any) -> None:
+def test_views_cost_little(crossing: Any) -> None:
     """At 20 Hz, in single precision: less than two thirds of what the recording itself takes."""
     sizes = crossing[2].sizes
     parts = ("/scene", "/tf", "/error", "/estimate", "/camera/")

@@ -13,10 +13,9 @@ from typing import Any
 
 import pytest
 
-from tests.fuzz import large, mcap, mrclam, scenarios, states
+from tests.fuzz import mcap, scenarios, states
 
-KINDS = {"states": (states, 20, 1000), "scenarios": (scenarios, 20, 3000)}
-KINDS |= {"mrclam": (mrclam, 30, 500), "mcap": (mcap, 20, 2000)}
+KINDS = {"states": (states, 20, 1000), "scenarios": (scenarios, 20, 3000), "mcap": (mcap, 20, 2000)}
 """A module of cases, and how many of them run here and in the slow tests."""
 LONGEST = 60.0
 """A case may take so long, s."""
@@ -44,7 +43,3 @@ def test_hostile_input(kind: str, all_of_them: bool, tmp_path: Path) -> None:
     found = outcomes(module, numbers, tmp_path / "case")
     for word in ("accepted", "refused"):  # or the cases would show nothing
         assert found[word] > len(numbers) // 20
-
-
-def test_large_scenarios(tmp_path: Path) -> None:
-    assert outcomes(large, range(len(large.CASES)), tmp_path / "case") == {"accepted": len(large.CASES)}

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.cars import codec
+from coopenv.cars.messages import codec
 from coopenv.estimation.lens import distort
 from coopenv.estimation.poses import log_so3
 from coopenv.observers import Recording

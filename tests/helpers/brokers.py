@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-from coopenv.cars.transport import Tls
+from coopenv.cars.link.transport import Tls
 from tests.helpers.processes import wait_until
 from tests.helpers.wire import free_port
 

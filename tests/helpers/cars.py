@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from coopenv.cars.backend.backend import Svea, open_svea
-from coopenv.cars.codec import encode, make
-from coopenv.cars.deployment import load_deployment
 from coopenv.cars.fake.car import Fake, fault_topic
-from coopenv.cars.fake.fleet import prepare_fake, run
+from coopenv.cars.fake.fleet import prepare_fake
 from coopenv.cars.fake.lockstep import Hub, LockstepFakes
-from coopenv.cars.transport import Transport
+from coopenv.cars.link.transport import Transport
+from coopenv.cars.messages.codec import encode, make
 
 PATIENT = """
 [safety] # a machine that runs many tests at once is slow
@@ -55,25 +53,6 @@ def fakes(path: Path) -> Iterator[tuple[Hub, Mapping[str, Fake]]]:
     """Return the cars of a deployment file on a simulated clock, which their station moves on."""
     made = LockstepFakes(path)
     yield made.hub, made.cars
-
-
-@contextmanager
-def threaded_fakes(path: Path) -> Iterator[Hub]:
-    """Let the cars of a deployment file live in real time until the block ends."""
-    deployment, hub, over = load_deployment(path), Hub(), threading.Event()
-    links = [hub.connect() for _ in deployment.cars]
-    made = [open_fake(path, car.name, link) for car, link in zip(deployment.cars, links, strict=True)]
-    threads = [threading.Thread(target=run, args=(fake, over), daemon=True) for fake in made]
-    for thread in threads:
-        thread.start()
-    try:
-        yield hub
-    finally:
-        over.set()
-        for thread in threads:
-            thread.join(timeout=5.0)
-        for link in links:
-            link.close()
 
 
 def cars(path: Path, hub: Hub, **options: Any) -> Svea:

@@ -11,14 +11,14 @@ import numpy as np
 
 from coopenv.cars.backend.backend import Svea
 from coopenv.cars.backend.binding import bind
-from coopenv.cars.clock import Clock
-from coopenv.cars.codec import decode, encode, make
-from coopenv.cars.deployment import Car, Deployment, Sensors
 from coopenv.cars.fake.car import Fake, fault_topic
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.gate import write_drive
-from coopenv.cars.profile import RESET_TOPIC, SVEA, CarProfile, MotionCommand, Role
-from coopenv.cars.transport import Arrival
+from coopenv.cars.gate.wheel_command import MotionCommand, write_drive
+from coopenv.cars.link.clock import Clock
+from coopenv.cars.link.transport import Arrival
+from coopenv.cars.messages.codec import decode, encode, make
+from coopenv.cars.settings.deployment import Car, Deployment, Sensors
+from coopenv.cars.settings.profile import RESET_TOPIC, SVEA, CarProfile, Role
 from coopenv.scenario import Scenario, load_scenario
 
 MARKERS = {"SL1": 1, "SL2": 2, "SL4": 4, "SL5": 5}

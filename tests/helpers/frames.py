@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from coopenv.cars.backend.backend import scenario_of
-from coopenv.cars.codec import encode, header, make
-from coopenv.cars.deployment import load_deployment
-from coopenv.cars.transport import Transport
+from coopenv.cars.link.transport import Transport
+from coopenv.cars.messages.codec import encode, header, make
+from coopenv.cars.settings.deployment import load_deployment
 from tests.helpers.processes import COOPENV, ROOT, start, wait_until
 
 FLEET = ROOT / "examples" / "fleet" / "tags.toml"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -74,14 +73,6 @@ def _sightings(robot: int, seconds: float) -> list[str]:
 def put(path: Path, rows: list[str]) -> None:
     """Write rows below the usual header of four lines."""
     path.write_text(HEADER + "".join(row + "\n" for row in rows))
-
-
-def real_folder() -> Path | None:
-    """Return a parent of recorded sub-datasets: what COOPENV_DATA says, or shared/data of a folder above."""
-    named = os.environ.get("COOPENV_DATA")
-    candidates = [Path(named)] if named else []
-    candidates += [above / "shared" / "data" for above in Path(__file__).resolve().parents]
-    return next((c for c in candidates if (c / "MRCLAM_Dataset6" / "Barcodes.dat").is_file()), None)
 
 
 DT = 0.025

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from benchmarks.robust.scenes import with_liars
 from coopenv.base.errors import ScenarioWarning
 from coopenv.observers import Message, Recording, Run, Tick, run
 from coopenv.observers.contract import Estimate
@@ -22,32 +23,11 @@ from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.robust_ticks import OpenRobust, Pose
 
-SEEN = (
-    ("SL1", "SL2", "SL3"),
-    ("SL1", "SL2", "SL3", "vehicle_1"),
-    ("SL2", "SL3", "vehicle_1", "vehicle_2"),
-    ("SL2", "SL3", "vehicle_1", "vehicle_2", "vehicle_3"),
-    ("SL3", "vehicle_1", "vehicle_2", "vehicle_3", "vehicle_4"),
-)
-
-
-def scene(
-    liars: tuple[int, ...] = (), horizon: float = 50.0, *, overrides: dict[str, Any] | None = None, **lie: Any
-) -> Scenario:
-    """Return the paper's five vehicles, each with two honest targets at least besides a liar, of which some lie."""
-    changes = {"observer.name": "robust", "horizon": horizon, **(overrides or {})}
-    raw = load_scenario("busy_intersection_tracking", changes).model_dump()
-    for vehicle, seen in zip(raw["vehicles"], SEEN, strict=True):
-        vehicle["neighbours"] = seen
-    for n in liars:
-        raw["vehicles"][n]["faults"] = {"lie": lie}
-    return Scenario(**raw)
-
 
 @cache
 def seen(horizon: float, seed: int) -> Recording:
     """Return a recording of that scene at 20 Hz."""
-    return record(scene(horizon=horizon, overrides={"rates.camera": 20.0, "rates.odometry": 60.0}), seed)
+    return record(with_liars(horizon=horizon, overrides={"rates.camera": 20.0, "rates.odometry": 60.0}), seed)
 
 
 @cache

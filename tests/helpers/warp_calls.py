@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from coopenv.world.launch import compiler_options, start_warp
+from coopenv.world.launch import compiler_options, launch, start_warp
 from coopenv.world.warp_internals import scalar_of
 
 DTYPES = ("float64", "float32")
@@ -68,7 +68,7 @@ class Calls:
         count = max(map(len, values))
         arrays = [_array(value, kind, count) for value, kind in zip(values, given, strict=True)]
         results = [wp.zeros(count, dtype=kind, device="cpu") for kind in found]
-        wp.launch(kernel, dim=count, inputs=arrays, outputs=results, device="cpu")
+        launch(kernel, dim=count, inputs=arrays, outputs=results, device="cpu")
         numbers = [_numpy(array) for array in results]
         return numbers[0] if len(numbers) == 1 else tuple(numbers)
 

@@ -9,7 +9,7 @@ import sys
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from coopenv.cars.transport import Arrival, Transport
+from coopenv.cars.link.transport import Arrival, Transport
 from tests.helpers.processes import started
 
 PING, PONG, ECHO = "fleet/ping", "fleet/pong", "fleet/alive/echo"
@@ -64,7 +64,7 @@ def listening(pid: int) -> list[str]:
 
 
 def _main(kind: str, endpoint: str) -> None:
-    from coopenv.cars.zenoh import open_zenoh
+    from coopenv.cars.link.zenoh import open_zenoh
 
     if kind == "router":
         transport = open_zenoh("router", listen=[endpoint])

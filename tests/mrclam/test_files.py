@@ -79,18 +79,15 @@ def test_missing_file(folder):
     ("file", "line", "text", "words"),
     [
         ("Robot1_Odometry.dat", 9, f"{ORIGIN + 0.18} 0.1\n", "2 columns, expected 3"),
-        ("Robot2_Groundtruth.dat", 7, f"{ORIGIN} 1 2 3 4\n", "5 columns, expected 4"),
         ("Robot2_Groundtruth.dat", 7, f"{ORIGIN} 1 2 x\n", "'x' is not a number"),
         ("Robot4_Measurement.dat", 6, f"{ORIGIN + 1.04} 118 inf 0.1\n", "not finite"),
         ("Robot4_Measurement.dat", 6, f"{ORIGIN + 1.04} 118 -1 0.1\n", "negative range"),
         ("Robot4_Measurement.dat", 6, f"{ORIGIN + 1.04} 118.5 1 0.1\n", "whole"),
-        ("Robot4_Measurement.dat", 6, "nan 118 1.0 0.1\n", "not finite"),
         ("Robot5_Odometry.dat", 8, f"{ORIGIN - 5} 0.1 0.1\n", "time runs backwards"),
         ("Robot5_Odometry.dat", 80, f"{ORIGIN + 0.5} 0.1 0.1\n", "rows may be out of order by less than 1 s"),
         ("Barcodes.dat", 6, "1 7\n", "occurs twice"),
         ("Barcodes.dat", 6, "21 7\n", "not in 1..20"),
         ("Landmark_Groundtruth.dat", 5, "5 0 0 0 0\n", "not in 6..20"),
-        ("Landmark_Groundtruth.dat", 6, "6 0 0 0 0\n", "occurs twice"),
     ],
 )
 def test_bad_line_is_named(folder, file, line, text, words):
@@ -100,31 +97,12 @@ def test_bad_line_is_named(folder, file, line, text, words):
     assert words in said
 
 
-@pytest.mark.parametrize("cut", [3, 25])
-def test_truncated_file(folder, cut):
-    path = folder / "Robot5_Groundtruth.dat"
-    text = path.read_text().rstrip("\n")
-    path.write_text(text[:-cut])
-    assert f"Robot5_Groundtruth.dat:{len(text.splitlines())}: " in message(folder)
-
-
-def test_last_line_end_may_miss(folder):
-    path = folder / "Robot5_Groundtruth.dat"
-    path.write_text(path.read_text().rstrip("\n"))
-    load_dataset("mrclam_6", folder)
-
-
 def test_empty_files(folder):
     (folder / "Robot1_Measurement.dat").write_text("# nothing seen\n")
     with pytest.warns(DataWarning, match="no detections of robot 1"):
         assert len(load_dataset("mrclam_6", folder).robots[0].detections) == 0
     (folder / "Robot1_Odometry.dat").write_text("# nothing\n")
     assert "Robot1_Odometry.dat:1: 0 rows" in message(folder)
-
-
-def test_binary_file(folder):
-    (folder / "Robot1_Odometry.dat").write_bytes(bytes(range(256)))
-    assert "Robot1_Odometry.dat:" in message(folder)
 
 
 @pytest.mark.parametrize("file", ["Robot2_Odometry.dat", "Robot3_Groundtruth.dat"])
@@ -165,7 +143,7 @@ def test_rows_a_little_late_are_put_in_order(folder):
     np.testing.assert_array_equal(after.odometry, before.odometry)
 
 
-def test_rows_whose_values_are_not_known_are_left_out(folder):
+def test_rows_with_unknown_values_are_left_out(folder):
     """The line that is named for another fault is still that of the file."""
     change(folder / "Robot3_Groundtruth.dat", 40, f"{ORIGIN + 0.70:.3f} NaN NaN NaN\n")
     with pytest.warns(DataWarning, match=r"rows with NaN left out: 1 of Robot3_Groundtruth.dat$"):
@@ -252,7 +230,7 @@ def test_a_command_is_not_held_for_ever(dataset):
     assert v.tolist() == [0.0, 0.2, 0.0, 0.1, 0.0]
 
 
-def test_what_is_of_no_use_is_told(tmp_path):
+def test_detections_without_use_are_reported(tmp_path):
     folder = write(tmp_path, seconds=40.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -282,7 +260,7 @@ def test_truth_in_degrees_or_mm_is_noticed(tmp_path):
             load_dataset("mrclam_6", folder)
 
 
-def test_detections_beyond_the_odometry_are_left_out_and_told(tmp_path):
+def test_detections_beyond_the_odometry_are_left_out_and_reported(tmp_path):
     folder = write(tmp_path, seconds=6.0)
     path = folder / "Robot2_Measurement.dat"
     table, others = np.loadtxt(path), [len(robot.detections) for robot in load_dataset("mrclam_6", folder).robots]

@@ -146,7 +146,7 @@ def test_bearing_derivatives_agree_with_differences(seen):
     np.testing.assert_allclose(own.covariance, P - np.outer(gain, h @ P), atol=1e-8)
 
 
-def test_what_a_linearised_bearing_leaves_out_is_as_drawn():
+def test_the_linearisation_error_of_a_bearing_is_as_drawn():
     """Monte Carlo: the spread of bearings about their linearisation, for ends as uncertain as a third of the line."""
     d, P = np.array([2.0, 1.0]), np.array([[0.5, 0.2], [0.2, 0.3]])
     e = np.random.default_rng(1).multivariate_normal(np.zeros(2), P / 4, 400_000)
@@ -157,7 +157,7 @@ def test_what_a_linearised_bearing_leaves_out_is_as_drawn():
 
 
 @pytest.mark.parametrize("std", [0.1, 0.8, 2.0])
-def test_what_an_unsure_heading_makes_of_a_path_is_as_drawn(std):
+def test_a_path_with_an_uncertain_heading_is_as_drawn(std):
     heading = std * np.random.default_rng(2).standard_normal(400_000)
     shrunk, along, across = unsure(std**2)
     assert np.cos(heading).mean() == pytest.approx(shrunk, abs=0.005)

@@ -193,7 +193,7 @@ def test_a_robot_that_is_carried_off_notices_and_finds_itself(seed, at):
     assert not any(Watched.all[n].lost_at for n in (0, 1, 3, 4))
 
 
-def test_who_starts_without_a_pose_searches():
+def test_robots_without_an_initial_pose_search():
     Watched.all = []
     record = recording_of(barrier_robots(4, 80.0), "landmarks+robots")
     turn = Rotation.from_euler("z", [[2.5], [-2.0], [1.5], [3.0], [-1.0]]).as_matrix()
@@ -241,7 +241,7 @@ def hostile() -> tuple[Message, ...]:
     )
 
 
-def test_what_is_no_message_ends_no_run_and_changes_nothing():
+def test_malformed_messages_change_nothing():
     record = recording_of(barrier_robots(1, 8.0), "landmarks+robots")
     babbling, silent = (
         completed(PlanarRobust, record, Tampering(*[lambda _, m=m: m for m in sent], vehicle=0))

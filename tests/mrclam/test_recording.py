@@ -16,20 +16,14 @@ from coopenv.mrclam.recording import DRIFT_STD, MESSAGE_PERIOD_TICKS, START_STD,
 from coopenv.observers.runner import run
 from coopenv.sources.sources import open_recording
 from tests.helpers.env_suite import rest_slow
-from tests.helpers.mrclam_files import LANDMARKS, command, pose, real_folder, write
+from tests.helpers.mrclam_files import LANDMARKS, command, pose, write
 
-REAL = real_folder()
 ORIGIN_S = 0.1  # of the synthetic files: the first odometry sample
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     return load_dataset("mrclam_6", write(tmp_path_factory.mktemp("data"), seconds=20.0))
-
-
-@pytest.fixture(scope="module")
-def recorded():
-    return load_dataset("mrclam_6", REAL)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +74,7 @@ def test_bearings_are_turned_to_the_tick(recording):
     assert np.isnan(recording.bearings[~recording.visible]).all()
 
 
-def test_everybody_hears_everybody_a_tick_late(recording):
+def test_messages_arrive_one_tick_late(recording):
     inbox = recording.inbox_tick
     assert (inbox[0] == -1).all()
     for k in (1, 2, 3, 10):
@@ -111,7 +105,7 @@ def test_truth_has_gaps(dataset):
     assert heading_known[known & ((r.t < 7.9) | (r.t > 8.55))].all()
 
 
-def test_a_robot_seen_late_starts_where_dead_reckoning_says(dataset):
+def test_a_robot_seen_late_starts_at_its_dead_reckoning(dataset):
     r = recording_of(with_truth(dataset, 3, np.arange(6.0, 18.0, 0.02)), "landmarks")
     whole = recording_of(dataset, "landmarks")
     np.testing.assert_allclose(r.start_position, whole.start_position, atol=2e-3)
@@ -226,35 +220,3 @@ class TestInSpace:
         r = recording_of(replace(dataset, robots=alone), "blind", in_space=True)
         std = np.sqrt(np.diagonal(run("robust", r).covariance[-1, 3], axis1=0, axis2=1))
         assert std[0] < 0.06 and std[1] < 0.06 and std[2] > 0.15
-
-
-@pytest.mark.skipif(REAL is None, reason="no MRCLAM_Dataset6 (name its parent in COOPENV_DATA)")
-class TestRecorded:
-    def test_content(self, recorded):
-        assert recorded.duration_s == pytest.approx(887.947, abs=1e-3)
-        assert sorted(recorded.landmarks) == list(range(6, 21))
-        assert [robot.skipped for robot in recorded.robots] == [1, 0, 2, 3, 0]
-        assert [len(robot.detections) for robot in recorded.robots] == [1941, 4031, 5625, 2396, 5378]
-
-    def test_dead_reckoning_as_known(self, recorded):
-        recording = recording_of(recorded, "blind")
-        assert recording.ticks == 17759
-        assert not np.isfinite(recording.truth.position[15300:, 0]).any()  # motion capture loses robot 1 at 760 s
-        known = np.array([2.61, 2.98, 4.24, 1.78, 1.73])
-        np.testing.assert_allclose(run("dead_reckoning", recording).position_rmse(), known, rtol=0.05)
-
-    @pytest.mark.slow
-    def test_targets(self, recorded):
-        position, heading = {}, {}
-        for variant in ("landmarks", "landmarks+robots", "blind"):
-            result = run(PlanarRobust, recording_of(recorded, variant))
-            assert not result.failure
-            assert 0.4 < np.mean(result.anees(after=TICK_S)) < 1.6
-            everything = result.t > 0
-            position[variant] = np.mean(result.position_rmse())
-            heading[variant] = np.mean(np.sqrt(result.mean(result.orientation_error**2, everything)))
-        assert position["landmarks"] < 0.13
-        assert position["landmarks+robots"] < position["landmarks"]
-        assert position["blind"] < 0.2
-        assert heading["landmarks"] < 4.0 and heading["landmarks+robots"] < 4.0
-        assert heading["blind"] < 5.0

@@ -172,16 +172,3 @@ def test_robots_without_landmarks_exclude_a_sender_that_two_others_contradict():
     completed(kept, record, Drifting([0], 0.0, 0.15, since=5.0))
     excluded = np.array([[one._monitors.of(target).excluded for target in range(15, 20)] for one in built])
     np.testing.assert_array_equal(excluded[1:], np.tile([True, False, False, False, False], (4, 1)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("seed", "blind", "jump", "drift"),
-    [(32, (4, 5), 0.0, 0.05), (51, (4, 5), 0.0, 0.05), (52, (4, 5), 5.0, 0.0), (32, (), 5.0, 0.0)],
-)
-def test_robots_without_landmarks_follow_the_correct_senders(seed, blind, jump, drift):
-    """Of three senders with landmarks two are correct; without any such sender a jump is detected, and no drift."""
-    robots = barrier_robots(seed, 100.0, 0.8)
-    record = recording_of(blindfolded(robots, *blind), "landmarks+robots") if blind else recording_of(robots, "blind")
-    honest, result = completed(PlanarRobust, record), completed(PlanarRobust, record, Drifting([0], jump, drift))
-    assert result.position_rmse()[1:].mean() < 2.0 * honest.position_rmse()[1:].mean()

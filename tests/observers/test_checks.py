@@ -43,7 +43,7 @@ LOPSIDED = np.eye(6) + np.eye(6, k=1) * 1e-3
         *(({"protection_level": level}, "protection_level is not two numbers") for level in NO_LEVELS),
     ],
 )
-def test_what_is_no_estimate(fields: dict[str, Any], said: str) -> None:
+def test_invalid_estimates_are_refused(fields: dict[str, Any], said: str) -> None:
     with pytest.raises(CoopenvError, match=said):
         check_estimate(Estimate(**{**POSE, **fields}))
 
@@ -69,7 +69,7 @@ def test_rotations_and_covariances_of_any_rank_and_size_are_estimates(seed: int,
         ({"extra": {"me": np.array([object()])}}, "message: extra 'me' is no array of numbers"),
     ],
 )
-def test_what_is_no_message(fields: dict[str, Any], said: str) -> None:
+def test_invalid_messages_are_refused(fields: dict[str, Any], said: str) -> None:
     with pytest.raises(CoopenvError, match=said):
         check_message(Message(**fields))
 

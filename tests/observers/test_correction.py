@@ -55,7 +55,7 @@ def test_recentring_of_the_invariant_error() -> None:
     assert np.abs(G - np.eye(6)).max() > 0.1
 
 
-def test_of_a_linear_measurement_it_is_the_kalman_update() -> None:
+def test_the_update_by_a_linear_measurement_is_the_kalman_update() -> None:
     rng = np.random.default_rng(0)
     P, H, N, r = spd(rng, 6), rng.normal(size=(4, 6)), spd(rng, 4), rng.normal(size=4)
     look = lambda at: (r - H @ at, H, N)  # noqa: E731
@@ -177,11 +177,11 @@ def passed(gate: InnovationGate, time: float, *sizes: float, ahead: np.ndarray =
     return gate.passed(time, residuals(*sizes), np.tile(S, (len(sizes), 1, 1)), ahead[: len(sizes)]).tolist()
 
 
-def test_it_refuses_one_honest_bearing_of_a_thousand() -> None:
+def test_the_gate_refuses_one_honest_bearing_of_a_thousand() -> None:
     assert abs(chi2.sf(LARGEST, 2) - 1e-3) < 1e-7
 
 
-def test_it_refuses_what_is_far_off_and_what_is_behind() -> None:
+def test_the_gate_refuses_far_bearings_and_bearings_behind() -> None:
     assert passed(InnovationGate(), 0.1, 0.0, 3.6, 3.8) == [True, True, False]
     assert passed(InnovationGate(), 0.1, 0.0, 0.0, 0.0, ahead=np.array([True, False, True])) == [True, False, True]
 
@@ -194,7 +194,7 @@ def test_a_covariance_that_is_none_takes_nothing() -> None:
     assert kept.tolist() == [True, False, False]
 
 
-def test_one_liar_of_two_never_opens_it_and_a_lost_pose_does() -> None:
+def test_a_lost_pose_opens_the_gate_and_one_wrong_bearing_of_two_does_not() -> None:
     lied, lost = InnovationGate(), InnovationGate()
     for k in range(1200):
         assert passed(lied, k / 60, 0.0, 50.0) == [True, False]
@@ -226,7 +226,7 @@ def test_a_swap_changes_no_filter_that_has_a_gate(name: str) -> None:
     assert result.nis_dof[20, 0] == 2 or name == "centralised"
 
 
-def test_the_row_without_a_gate_believes_it() -> None:
+def test_a_filter_without_a_gate_takes_a_swap() -> None:
     made = swapped(30, 20)
     gated, ungated = run("mekf_covariance", made), run("mekf_covariance_ungated", made)
     assert ungated.position_error[20, 0] > 2.0 * gated.position_error[20, 0]

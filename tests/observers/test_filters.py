@@ -299,7 +299,7 @@ def test_ticks_of_other_types_are_as_good(name: str) -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_it_is_consistent_for_any_correlation_of_the_dependent_parts(seed: int) -> None:
+def test_split_intersection_is_consistent_for_any_correlation_of_the_dependent_parts(seed: int) -> None:
     rng = np.random.default_rng(seed)
     scale = np.diag(10.0 ** rng.uniform(-1, 1, 9))
     joint = scale @ spd(rng, 9) @ scale  # of both dependent parts, correlated in any way
@@ -331,7 +331,7 @@ def test_without_dependent_parts_it_is_the_kalman_filter() -> None:
     assert_allclose(split.covariance[-1, 1], plain.covariance[-1, 1], rtol=0.03, atol=1e-12)
 
 
-def test_it_knows_no_less_than_where_all_is_dependent() -> None:
+def test_split_intersection_is_no_less_certain_than_covariance_intersection() -> None:
     """After some frames of the same leader it claims more than plain intersection and less than what counts twice."""
     made = small_record(6)
     split, plain, naive = (

@@ -7,7 +7,6 @@ import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,13 +17,12 @@ from numpy.testing import assert_allclose
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
-from coopenv.observers import Estimate, Message, Received, Recording, Tick, kernel_observer, register, registry
+from coopenv.observers import Estimate, Message, Received, Recording, Tick, register, registry
 from coopenv.observers.kernel_observer import MOST_UNITS, UNITS_PER_TICK
 from coopenv.observers.pose_filters import DeadReckoning
 from coopenv.observers.registry import find, find_embedded, named, portable
 from coopenv.scenario.schema import neighbour_sets
 from coopenv.sources.worlds import Replay
-from coopenv.world import warp_internals
 from coopenv.world.embedded import Embedded, send_nothing, start_nothing
 from coopenv.world.state import array
 from tests.helpers.commands import refused
@@ -144,7 +142,7 @@ def test_malformed_messages_are_as_none_and_counted() -> None:
     assert follower.ignored_messages == len(bad)
 
 
-def test_a_message_from_before_the_start_is_not_heard() -> None:
+def test_a_message_from_before_the_start_is_not_received() -> None:
     follower, leader, recording = observer_and_leader()
     target = recording.setups[0].landmarks + 2
     follower.update(recording.tick(1, 3, {target: Received(leader.message(), 1.0)}))
@@ -198,7 +196,7 @@ COUNTER = Embedded("toy_counter", estimate, start, send_nothing, Counter)
 register(COUNTER.name, embedded=COUNTER)
 
 
-def test_what_is_no_function_of_kernels_is_one_line(tmp_path: Path) -> None:
+def test_functions_that_are_no_kernels_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(CoopenvError, match=r"observer 'plain': estimate: expected a Warp function \(@wp.func\) of 6"):
         Embedded("plain", lambda model, state, memory, world, vehicle, now: None, start, send_nothing)
     with pytest.raises(CoopenvError, match=r"observer 'few': send: expected a Warp function \(@wp.func\) of 6 arg"):
@@ -233,7 +231,7 @@ def test_an_estimate_that_is_no_number_ends_a_run() -> None:
 
 
 @pytest.mark.parametrize("observer", ["toy_counter", COUNTER])
-def test_it_runs_in_an_environment(observer: str | Embedded) -> None:
+def test_embedded_observers_run_in_an_environment(observer: str | Embedded) -> None:
     env = coopenv.parallel_env("busy_intersection", observer=observer, dtype="float64")
     env.reset(seed=0)
     env.step({agent: np.zeros(2) for agent in env.agents})
@@ -266,7 +264,7 @@ def test_batch_replay_and_saved_states_keep_its_memory() -> None:
     assert engine.world.memory.ticks.numpy().tolist() == [[7] * 5]
 
 
-def test_it_is_compared_with_others() -> None:
+def test_embedded_observers_are_compared_with_others() -> None:
     recording = simulated()
     for observer in ("toy_counter", COUNTER):
         result = completed(observer, recording)
@@ -371,13 +369,13 @@ def test_a_class_that_is_defined_once_more_takes_the_place_of_the_old_one() -> N
 
 
 @pytest.mark.parametrize("observer", ["mine.py:number", 3, lambda setup: None, object()])
-def test_what_is_no_observer(observer: object) -> None:
+def test_objects_that_are_no_observers_are_refused(observer: object) -> None:
     with pytest.raises(CoopenvError, match="expected a"):
         named(observer)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("observer", ["mine.py:Mine", Other])
-def test_in_an_environment(observer: str | type) -> None:
+def test_observers_in_files_estimate_in_an_environment(observer: str | type) -> None:
     """It estimates as the observer of the zoo that it is derived from."""
     options = {"dtype": "float64", "overrides": {"horizon": 0.5}}
     estimates = []
@@ -392,34 +390,3 @@ def test_in_an_environment(observer: str | type) -> None:
 def test_a_scenario_cannot_name_code() -> None:
     with pytest.raises(CoopenvError, match=r"observer\.name"):
         coopenv.load_scenario("overtaking", {"observer.name": "mine.py:Mine"})
-
-
-def test_warp_starts_without_its_banner_before_an_observer_on_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
-    called: list[str] = []
-    start, model = kernel_observer.start_warp, kernel_observer.model_of
-    monkeypatch.setattr(kernel_observer, "start_warp", lambda: (called.append("start"), start()))
-    monkeypatch.setattr(kernel_observer, "model_of", lambda *given: (called.append("model"), model(*given))[1])
-    find("riccati")(simulated().setups[0])
-    assert called[:2] == ["start", "model"]
-
-
-GENERATED = (
-    "void f(Record var_model)\n{\n    Record var_model = _wp_args->model;\n    wp::address(x, i); wp::index(x, i);\n}"
-)
-
-
-@pytest.mark.parametrize("module", ["users_own", "coopenv.of_the_test"])
-def test_kernels_and_functions_of_other_modules_have_the_source_that_warp_gives_them(
-    monkeypatch: pytest.MonkeyPatch, module: str
-) -> None:
-    function = SimpleNamespace(__module__=module)
-    kernel = SimpleNamespace(
-        func=function, module=SimpleNamespace(name=module), options={}, adj=SimpleNamespace(args=[])
-    )
-    monkeypatch.setattr(warp_internals, "_generate", lambda *_: GENERATED)
-    monkeypatch.setattr(warp_internals, "_generate_function", lambda *_, **given: GENERATED)
-    options = {"enable_backward": False}
-    made = warp_internals._kernel_source(kernel, "cpu", options)
-    called = warp_internals._function_source(SimpleNamespace(func=function), device="cpu", options=options)
-    assert made == called and (made == GENERATED) == (module == "users_own")
-    assert ("coopenv::element" in made) == (module != "users_own")

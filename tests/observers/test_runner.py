@@ -33,7 +33,6 @@ from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.helpers.recordings import completed
 from tests.helpers.recordings import simulated as recording
-from tests.helpers.sessions import ROOT, blocks
 from tests.oracles.batch import small_errors
 
 NAMES = sorted({*registry.zoo()} & {*registry.available_names(planar=False)})
@@ -71,7 +70,7 @@ def probe(record_: Recording) -> list[tuple[str, Tick]]:
     return Mine.seen
 
 
-def test_without_delay_a_leader_is_heard_in_the_same_tick() -> None:
+def test_without_delay_a_leader_is_received_in_the_same_tick() -> None:
     seen = probe(recording())
     assert len(seen) == 60 * 5
     for _, tick in seen:
@@ -185,15 +184,12 @@ class UnspeakableError(Exception):
         (lambda e: (e.rotation, e.position), "update returned (array("),
         (lambda e: replace(e, position=e.position[None]), "position is not a finite array of shape (3,)"),
         (lambda e: replace(e, position=e.position * np.nan), "position is not a finite array of shape (3,)"),
-        (
-            lambda e: (_ for _ in ()).throw(UnspeakableError()),
-            "UnspeakableError: no message: its text raises ZeroDivisionError",
-        ),
+        (lambda e: (_ for _ in ()).throw(UnspeakableError()), "UnspeakableError: no message: its text raises"),
         (lambda e: (_ for _ in ()).throw(ValueError("\x1b[2J" + "a" * 5000)), "ValueError: \\x1b[2Jaaa"),
         (lambda e: replace(e, nis="small", nis_dof=2), "TypeError"),
     ],
 )
-def test_what_is_no_estimate_is_one_error_line(change: Any, said: str) -> None:
+def test_invalid_estimates_are_one_error_line(change: Any, said: str) -> None:
     class Odd(Probe):
         def update(self, tick: Tick) -> Estimate:
             return change(super().update(tick))
@@ -225,7 +221,7 @@ def test_a_sent_message_does_not_change_any_more() -> None:
         (Message(np.full(3, np.nan)), "message: position is not a finite array of shape (3,) with numbers up to 1e+09"),
     ],
 )
-def test_what_is_no_message_is_one_error_line(odd: Any, said: str) -> None:
+def test_invalid_messages_are_one_error_line(odd: Any, said: str) -> None:
     class Odd(Probe):
         def message(self) -> Any:
             return odd if self.index == 6 else super().message()
@@ -242,7 +238,7 @@ SENSED = ("rotation", "translation", "velocity", "angular_velocity", "targets", 
 
 
 @pytest.mark.parametrize("name", [*SENSED, "lever_arm"])
-def test_what_is_sensed_cannot_be_written_to(name: str) -> None:
+def test_sensed_values_are_read_only(name: str) -> None:
     class Vandal(Probe):
         def update(self, tick: Tick) -> Estimate:
             getattr(tick, name)[:] = 0
@@ -252,7 +248,7 @@ def test_what_is_sensed_cannot_be_written_to(name: str) -> None:
 
 
 @pytest.mark.parametrize("restored", [False, True])
-def test_what_all_receivers_hear_none_can_write_to(restored: bool) -> None:
+def test_messages_to_all_receivers_are_read_only(restored: bool) -> None:
     made = recording()
     group = ObserverGroup(Probe, made.observer_init)
     group.start(made.start_rotation, made.start_position)
@@ -377,23 +373,6 @@ def test_observers_of_installed_packages(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "broken" in list_observers() and "broken" not in registry.available_names()
     assert "theirs" in registry.available_names() and not registry.obstacle("theirs")
     assert "no_such_module" in registry.obstacle("broken") and "\n" not in registry.obstacle("broken")
-
-
-def filters_of_the_documents() -> dict[str, Any]:
-    """Return the filters that readers copy, by the name of their source."""
-    page = next(block for block in blocks(ROOT / "docs" / "tutorials" / "own_observer.md") if block.file)
-    tutorial: dict[str, Any] = {}
-    exec(compile(page.code, "own_observer.md", "exec"), tutorial)
-    return {"tutorial": tutorial["Mine"], "example": runpy.run_path(str(ROOT / "examples" / "own_observer.py"))["Ekf"]}
-
-
-@pytest.mark.parametrize("seed", [0, 5])
-def test_filters_of_the_documents_have_no_excursion_at_the_start(seed: int) -> None:
-    made = record(load_scenario("busy_intersection_tracking", {"horizon": 0.5}), seed)
-    for name, factory in filters_of_the_documents().items():
-        result = run(factory, made)
-        assert not result.failure and result.position_error.max() < 3.0, name
-        assert result.coordinates is Coordinates.LEFT and 0.2 < np.median(result.nees[1:]) / 6.0 < 5.0, name
 
 
 @pytest.mark.slow

@@ -112,7 +112,7 @@ def test_points_in_a_bundle_are_too_weak() -> None:
     assert_allclose(estimate.position, P_TRUE + 0.5)
 
 
-def test_a_neighbour_s_covariance_widens_one_s_own() -> None:
+def test_a_neighbour_s_covariance_widens_the_receiver_s() -> None:
     seen = frame(3)
     marks = POINTS.copy()
     sure, unsure = (
@@ -186,7 +186,7 @@ def transform(p: np.ndarray) -> np.ndarray:
     return block_diag(*[np.block([[np.eye(3), np.zeros((3, 3))], [skew(x), np.eye(3)]]) for x in p])
 
 
-def test_it_is_the_filter_in_transformed_coordinates() -> None:
+def test_first_estimates_are_the_filter_in_transformed_coordinates() -> None:
     """arXiv 2303.01205: in xi = T e the propagation is the identity, and T is taken at the present estimate."""
     made = record(load_scenario("busy_intersection_tracking", {"horizon": 0.5}), 4)
     L, N = made.landmarks.shape[1], len(made.setups)

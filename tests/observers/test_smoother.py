@@ -31,7 +31,7 @@ def test_with_small_errors_it_is_the_dense_least_squares(
     assert_most_probable(name, range(5), 5)
 
 
-def test_in_a_lane_it_is_at_least_as_good_as_every_filter() -> None:
+def test_in_a_lane_the_smoother_is_at_least_as_good_as_every_filter() -> None:
     """Range along a lane is weakly determined: `centralised` linearises it once and is overconfident."""
     made = record(load_scenario("lane:5", {"horizon": 5.0}), 3)
     rmse = {
@@ -83,7 +83,7 @@ def test_a_missing_module_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPat
         find("factor_graph")
 
 
-def test_of_bearings_at_key_frames_it_is_the_filter() -> None:
+def test_with_bearings_at_key_frames_the_graph_is_the_filter() -> None:
     """With small errors, what is most probable at the last frame does not depend on smoothing the others."""
     pytest.importorskip("gtsam", reason="needs the extra 'bench'")
     made = small_record(12)  # 6 ticks of 60 Hz are one key frame

@@ -107,11 +107,7 @@ SLOW = {**WHOLE, "action.longitudinal": "acceleration"}
 @pytest.mark.parametrize(
     ("common", "overrides", "message"),
     [
-        (
-            {},
-            {"observation.position_scale": 7.0},
-            r"another observation: 'estimate_position' had scale 8\.0 and has 7\.0",
-        ),
+        ({}, {"observation.position_scale": 7.0}, r"another observation: 'estimate_position' had scale 8\.0"),
         ({}, {"observation.include": ["odometry", "goal"]}, r"'estimate_position' is not in this environment"),
         ({}, {"dynamics.max_speed": 1.5}, r"another action: 'speed' had high 1\.0 and has 1\.5 here"),
         ({}, {"action.longitudinal": "acceleration"}, r"another action: 'speed' is not in this environment"),
@@ -119,16 +115,12 @@ SLOW = {**WHOLE, "action.longitudinal": "acceleration"}
         (WHOLE, {"observation.route_step": 1.0}, r"another observation\.route_step, 0\.5, and it is 1\.0 here"),
         (WHOLE, {"observer.gramian_window": 2.0}, r"another observer\.gramian_window, 1\.0, and it is 2\.0 here"),
         (WHOLE, {"observer.gramian_distance": 3.0}, r"another observer\.gramian_distance, None, and it is 3\.0 here"),
-        (
-            WHOLE,
-            {"reward.observability_floor": 1e-4},
-            r"another reward\.observability_floor, 1e-05, and it is 0\.0001 here",
-        ),
+        (WHOLE, {"reward.observability_floor": 1e-4}, r"another reward\.observability_floor, 1e-05, and it is 0\.0001"),
         (WHOLE, {"rates.decision": 5.0}, r"another rates\.decision, 10\.0, and it is 5\.0 here"),
         (SLOW, {"dynamics.max_speed": 1.5}, r"another dynamics\.max_speed, 1\.0"),
     ],
 )
-def test_what_gives_entries_another_meaning_is_refused_with_both_values(
+def test_settings_that_change_the_meaning_of_entries_are_refused_with_both_values(
     common: dict[str, Any], overrides: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     """The size of the observation may be the same: without this an agent would drive by what it misreads."""

@@ -69,26 +69,14 @@ NAMES = [f"vehicle_{i + 1}" for i in range(40)]
 @pytest.mark.parametrize(
     ("neighbours", "sections", "words"),
     [
-        (
-            [[name] for name in NAMES[1:] + NAMES[:1]],
-            {},
-            r"\(vehicle_\d+( -> vehicle_\d+){5} -> 34 more -> vehicle_\d+\)",
-        ),
-        (
-            [None, ["L1", "vehicle_11"]],
-            {},
-            r"vehicles.1.neighbours: unknown target 'vehicle_11' \(did you mean 'vehicle_1'",
-        ),
+        ([[name] for name in NAMES[1:] + NAMES[:1]], {}, r"\(vehicle_\d+( -> vehicle_\d+){5} -> 34 more"),
+        ([None, ["L1", "vehicle_11"]], {}, r"vehicles.1.neighbours: unknown target 'vehicle_11'"),
         ([None, ["L1", "vehicle_2"]], {}, "vehicles.1.neighbours: a vehicle cannot be its own neighbour"),
         ([None, None], {"observer": {"k": [1.0, 2.0, 3.0]}}, "observer.k: 3 values for 2 vehicles"),
         ([None], {"observer": {"q": {"L9": 1.0}}}, "observer.q: unknown target 'L9'"),
         ([None], {"dynamics": {"latency": 0.2}}, r"dynamics.latency: 0.2 s is longer than one decision \(0.1 s\)"),
         ([None], {"action": {"steering": 1.0}}, "action.steering: 1 rad is above dynamics.max_steering"),
-        (
-            [None],
-            {"vehicles": [vehicle((1, 1, 1)), vehicle((1, 1, 1))]},
-            "vehicle_2 starts in the place of vehicle_1",
-        ),
+        ([None], {"vehicles": [vehicle((1, 1, 1)), vehicle((1, 1, 1))]}, "vehicle_2 starts in the place of vehicle_1"),
     ],
 )
 def test_sections_must_fit_one_another(
@@ -98,7 +86,7 @@ def test_sections_must_fit_one_another(
         fleet(*neighbours, **sections)
 
 
-def test_what_just_fits_is_taken() -> None:
+def test_values_at_their_limits_are_accepted() -> None:
     assert fleet(None, None, observer={"k": [1.0, 2.0]}).observer.k == (1.0, 2.0)
     fleet(None, dynamics={"latency": 0.1})
 
@@ -143,11 +131,7 @@ def landmarks(count: int) -> list[dict[str, Any]]:
         (None, {"landmarks": landmarks(1)}, "only 1 landmark:"),
         (None, {"landmarks": landmarks(2)}, "only 2 landmarks"),
         (None, {"map": {"origin": [60.0, 0, 0]}}, r"landmark 'L1' lies \d+ m from the map origin.*set map.origin"),
-        (
-            [vehicle(), vehicle((3, 3, 0), neighbours=["L1", "vehicle_1"])],
-            {},
-            "vehicle_2 has fewer than three neighbours",
-        ),
+        ([vehicle(), vehicle((3, 3, 0), neighbours=["L1", "vehicle_1"])], {}, "vehicle_2 has fewer than three"),
         (
             [vehicle((x, 0, 0), body={"size": [2.0, 1.0, 1.0]}) for x in (0.0, 1.9, 5.0, 6.9, 8.8)],
             {},
@@ -264,9 +248,7 @@ def test_many_vehicles_on_equal_routes_are_compared_up_to_the_first_overlap(
 def test_comparisons_of_starts_have_a_limit(monkeypatch: pytest.MonkeyPatch, most: str) -> None:
     monkeypatch.setattr(starts, most, 20)
     if most == "MOST_STARTS":
-        with pytest.raises(
-            ScenarioError, match=r"vehicles.1: routes and spreads up to this vehicle are over 20 starts"
-        ):
+        with pytest.raises(ScenarioError, match=r"vehicles.1: routes and spreads up to this vehicle are over 20"):
             parse_scenario(fleet_on_routes(2, apart=0.1), "here")
     else:
         with warnings.catch_warnings():
@@ -292,7 +274,7 @@ def test_routes_that_follow_one_another_have_a_limit(monkeypatch: pytest.MonkeyP
         parse_scenario(raw, "here")
 
 
-def test_what_a_file_stands_for_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_expanded_size_of_a_file_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files, "MOST_BYTES", 1000)
     many = {**builders.vehicle(), "neighbours": ["L1"] * 100}
     with pytest.raises(ScenarioError, match=r"scenario: vehicles.0.count: 9 times its length is 0 MiB, over 0 MiB"):

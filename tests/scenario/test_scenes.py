@@ -71,7 +71,7 @@ def test_every_scene_is_a_world(name: str) -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(names([kind for kind in SCENES if kind not in ROADS]))
-def test_nobody_leaves_the_scene(name: str) -> None:
+def test_vehicles_stay_in_the_scene(name: str) -> None:
     """Ten minutes long nobody gets farther than 26 m, or the length of a lap, from the start."""
     scenario = made(name)
     for vehicle in scenario.vehicles:
@@ -118,19 +118,13 @@ def test_a_ring_goes_round() -> None:
     ("name", "message"),
     [
         ("lane:1", "scene lane: vehicles = '1', allowed are whole numbers 2 to 4096"),
-        ("lane:many", "scene lane: vehicles = 'many', allowed are whole numbers 2 to 4096"),
         ("lane:8,seen=9", "scene lane: seen = '9', allowed are whole numbers 1 to 8"),
         ("roots:8,seed=1", "scene roots: unknown option 'seed'; allowed: vehicles (3..4096)"),
-        ("tree:8,9", "scene tree: unknown option '9'"),
         ("ring:8,seen=1,seen=2", "scene ring: seen is given twice"),
         ("lanes:8", "unknown environment 'lanes:8'"),
-        ("road:0", "scene road: vehicles = '0', allowed are whole numbers 2 to 64"),
         ("road:3,speed=-1", "scene road: speed = '-1', allowed are numbers 1 to 50"),
-        ("road:3,speed=nan", "scene road: speed = 'nan', allowed are numbers 1 to 50"),
         ("road:3,speed=1e1", "scene road: speed = '1e1', allowed are numbers 1 to 50"),
         ("road:3,foo=1", "unknown option 'foo'; allowed: vehicles (2..64), speed (1..50), lanes (1..2)"),
-        ("road:3,lanes=1.5", "scene road: lanes = '1.5', allowed are whole numbers 1 to 2"),
-        ("crossroad:9,lanes=1", "unknown option 'lanes'; allowed: vehicles (2..64), speed (1..50)"),
     ],
 )
 def test_a_wrong_name_is_one_error_line(name: str, message: str) -> None:
@@ -143,7 +137,7 @@ def test_paths_are_no_scenes() -> None:
     assert is_scene("lane:8") and not is_scene("lane:8.toml") and not is_scene("lane:a/b") and not is_scene("lane")
 
 
-def test_what_is_known_without_the_simulation_is_all_there_is() -> None:
+def test_names_of_scenes_are_known_without_the_simulation() -> None:
     assert tuple(SCENES) == installation.SCENES and [row["name"] for row in scene_rows()] == [
         f"{kind}:N" for kind in SCENES
     ]
@@ -170,7 +164,7 @@ def test_as_many_vehicles_as_allowed_run() -> None:
 
 
 @pytest.mark.parametrize("name", ["lane:6", "roots:6", "tree:7", "random:6,seed=4", "ring:4", "road:5", "crossroad:5"])
-def test_everybody_can_be_found(name: str) -> None:
+def test_bearings_locate_every_vehicle(name: str) -> None:
     """The bound falls below a quarter of a metre within seconds: the bearings of every vehicle suffice."""
     bound = cramer_rao_ancestors(record(made(name, horizon=8.0, rates__camera=20.0, rates__odometry=20.0), 0))
     assert bound.position[0].min() > 0.7 and bound.position[-1].max() < 0.3

@@ -9,11 +9,20 @@ import numpy as np
 import pytest
 
 from coopenv.base.installation import list_agents, list_envs
-from coopenv.cars.deployment import Car, Deployment, GateLink, NetworkSettings, Remote, Safety, Security, Sensors
 from coopenv.cars.fake.settings import FakeSettings
-from coopenv.cars.profile import SVEA
-from coopenv.cars.sensor_settings import Correction
-from coopenv.cars.transport import Tls
+from coopenv.cars.link.transport import Tls
+from coopenv.cars.settings.deployment import (
+    Car,
+    Deployment,
+    GateLink,
+    NetworkSettings,
+    Remote,
+    Safety,
+    Security,
+    Sensors,
+)
+from coopenv.cars.settings.profile import SVEA
+from coopenv.cars.settings.sensors import Correction
 from coopenv.observers import registry
 from coopenv.observers.registry import zoo
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS

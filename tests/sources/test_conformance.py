@@ -1,13 +1,12 @@
-"""One suite over all backends: the same spaces, the same meaning of actions, masks and ages, whatever gives the ticks.
+"""One suite over all sources: the same spaces, the same meaning of actions, masks and ages, whatever gives the ticks.
 
-Simulator, fakes in this process, fakes in processes of their own over Zenoh, a recorded drive, and that drive as a bag.
+Simulator, fake cars, a recorded drive, and that drive as a bag. `tests/cars` has fake cars as processes, over Zenoh.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,15 +16,10 @@ import pytest
 from pettingzoo.test import parallel_api_test
 
 import coopenv
-from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend.backend import open_svea
-from coopenv.cars.codec import decode
-from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.transport import Arrival
-from coopenv.cars.zenoh import open_zenoh
-from tests.helpers.cars import LAB, LAB_CARS, OVERTAKING, PATIENT, cars, fakes, write_fleet
-from tests.helpers.processes import COOPENV, start
-from tests.helpers.wire import free_port
+from coopenv.cars.link.transport import Arrival
+from coopenv.cars.messages.codec import decode
+from coopenv.cars.settings.profile import SVEA, Role
+from tests.helpers.cars import LAB, LAB_CARS, cars, fakes, write_fleet
 
 Env = coopenv.CooperativeLocalisationEnv
 Make = Callable[..., Env]
@@ -44,10 +38,6 @@ def in_process(path: Path, hub: Any, **options: Any) -> Env:
     return coopenv.parallel_env("cars", backend=cars(path, hub, overrides=OVERRIDES), **options)
 
 
-def over_zenoh(path: Path, **options: Any) -> Env:
-    return coopenv.parallel_env("cars", backend=open_svea(path, overrides=OVERRIDES), **options)
-
-
 def recorded(path: Path, **options: Any) -> Env:
     return coopenv.parallel_env(path, **options)
 
@@ -62,24 +52,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def processes(folder: Path) -> Iterator[Path]:
-    """Start two fake cars, each a process, and their router in this one."""
-    port = free_port()
-    network = f'[network]\nconnect = ["tcp/127.0.0.1:{port}"]\n'
-    path = folder / "zenoh.toml"
-    path.write_text(OVERTAKING + PATIENT + network)
-    with ExitStack() as stack:
-        stack.callback(open_zenoh("router", listen=[f"tcp/127.0.0.1:{port}"]).close)
-        fake = [*COOPENV, "svea", "fake", str(path), "--car"]
-        both: list[Any] = [start([*fake, car], folder) for car in ("svea7", "svea1")]  # which load at a time
-        for process in both:
-            stack.callback(process.wait)
-            stack.callback(process.kill)
-        assert all("ready" in process.stdout.readline() for process in both)
-        yield path
-
-
-@pytest.fixture(scope="module")
 def drive(folder: Path) -> Path:
     """Record a drive of three seconds, of which a busy computer takes part of the frames."""
     with fakes(path := write_fleet(folder)) as (hub, _):
@@ -91,7 +63,7 @@ def drive(folder: Path) -> Path:
     return folder / "drive.mcap"
 
 
-@pytest.fixture(scope="module", params=["simulated", "drive", "bag", "in process", "over zenoh"])
+@pytest.fixture(scope="module", params=["simulated", "drive", "bag", "in process"])
 def make(request: pytest.FixtureRequest, folder: Path) -> Iterator[Make]:
     """Yield what makes the environment; fake cars in this process drive for no longer than they are asked for."""
     if request.param == "simulated":
@@ -99,8 +71,6 @@ def make(request: pytest.FixtureRequest, folder: Path) -> Iterator[Make]:
     elif request.param == "in process":
         with fakes(path := write_fleet(folder)) as (hub, _):
             yield partial(in_process, path, hub)
-    elif request.param == "over zenoh":
-        yield partial(over_zenoh, request.getfixturevalue("processes"))
     elif request.param == "drive":
         yield partial(recorded, request.getfixturevalue("drive"))
     else:
@@ -119,7 +89,7 @@ def assert_spaces_of_the_simulator(env: Env, observation: Any) -> None:
     assert env.observation_layout == expected.observation_layout
 
 
-def test_it_passes_the_official_test(make: Make) -> None:
+def test_sources_pass_the_official_test(make: Make) -> None:
     env = make()
     assert_spaces_of_the_simulator(env, "flat")
     with warnings.catch_warnings():
@@ -184,10 +154,10 @@ def driving(commands: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
     return {n: command for n, command in commands.items() if n >= first}
 
 
-def test_actions_mean_the_same_speeds_and_angles(folder: Path, processes: Path) -> None:
-    """The commands to the gates equal the commands of the simulated vehicles, on any network.
+def test_actions_mean_the_same_speeds_and_angles(folder: Path) -> None:
+    """The commands to the gates equal the commands of the simulated vehicles.
 
-    Commands are not sent again where a network loses one, so that actions go on until enough have been heard.
+    Commands are not sent again where a network loses one, so that actions go on until enough have been received.
     """
     actions = np.random.default_rng(3).uniform(-1.0, 1.0, (40, 2)).astype(np.float32)  # none repeats
     expected = simulated()
@@ -198,40 +168,24 @@ def test_actions_mean_the_same_speeds_and_angles(folder: Path, processes: Path) 
         simulated_commands.append(expected.engine.view("command")[0, :, :2].copy())
     assert len({tuple(np.round(command[0], 6)) for command in simulated_commands}) > 4
     wanted = dict(zip(("svea7", "svea1"), np.swapaxes(simulated_commands, 0, 1), strict=True))
-
-    def check(network: Any, env: Env) -> None:
-        arrivals: list[Arrival] = []
+    arrivals: list[Arrival] = []
+    received: dict[str, dict[int, np.ndarray]] = {car: {} for car in wanted}
+    with fakes(path := write_fleet(folder)) as (hub, _):
+        network, env = hub.connect(), in_process(path, hub)
         for car in wanted:
             network.subscribe(SVEA.topic_of(car, Role.COMMAND), arrivals.append)
-        heard: dict[str, dict[int, np.ndarray]] = {car: {} for car in wanted}
-        try:
-            env.reset(seed=1, options={"arm": True})
-            for action in actions:
-                env.step(dict.fromkeys(env.possible_agents, action))
-                for car, commands in heard.items():
-                    for arrival in [a for a in arrivals if car in a.topic]:
-                        command = decode(arrival.payload, SVEA.topics[Role.COMMAND].type)
-                        number = int(command.header.frame_id.rpartition(":")[2])
-                        commands[number] = np.array([command.drive.speed, command.drive.steering_angle])
-                if min(len(driving(commands)) for commands in heard.values()) >= 6:
-                    break
-        finally:
-            env.close()
-            network.close()
-        for car, commands in heard.items():
-            assert len(driving(commands)) >= 6, (car, commands)
-            assert len(begins_at(driving(commands), wanted[car])) == 1, (car, commands)
-
-    endpoints = [line.split('"')[1] for line in processes.read_text().splitlines() if "tcp/" in line]
-    check(open_zenoh("client", endpoints), over_zenoh(processes))
-    with fakes(path := write_fleet(folder)) as (hub, _):
-        check(hub.connect(), in_process(path, hub))
-
-
-def test_unknown_options_are_refused(make: Make) -> None:
-    env = make()
-    try:
-        with pytest.raises(CoopenvError, match="nonsense"):
-            env.reset(seed=0, options={"nonsense": 1})
-    finally:
+        env.reset(seed=1, options={"arm": True})
+        for action in actions:
+            env.step(dict.fromkeys(env.possible_agents, action))
+            for car, commands in received.items():
+                for arrival in [a for a in arrivals if car in a.topic]:
+                    command = decode(arrival.payload, SVEA.topics[Role.COMMAND].type)
+                    number = int(command.header.frame_id.rpartition(":")[2])
+                    commands[number] = np.array([command.drive.speed, command.drive.steering_angle])
+            if min(len(driving(commands)) for commands in received.values()) >= 6:
+                break
         env.close()
+        network.close()
+    for car, commands in received.items():
+        assert len(driving(commands)) >= 6, (car, commands)
+        assert len(begins_at(driving(commands), wanted[car])) == 1, (car, commands)

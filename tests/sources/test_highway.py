@@ -190,7 +190,7 @@ def test_to_touch_other_traffic_is_a_collision() -> None:
     assert engine.view("ended")[0, 3] == 2 and engine.view("tick")[0] < 20
 
 
-def test_who_leaves_the_road_has_arrived() -> None:
+def test_a_vehicle_that_leaves_the_road_has_arrived() -> None:
     vehicles = [{"motion": {"kind": "driven"}}] + [{"motion": {"kind": "traffic"}}] * 2
     engine = engine_of(CROSSING, horizon=40.0, vehicles=vehicles)
     engine.reset([3])
@@ -225,45 +225,25 @@ def test_a_plain_environment_in_the_same_program_changes_nothing(monkeypatch: py
         ({"backend": "simulated"}, 'highway: only with backend = "highway"'),
         ({"backend": "higway"}, "backend: Input should be 'simulated', 'highway', 'sumo' or 'program'"),
         ({"highway.id": "intersection-v9"}, r"highway\.id: highway-env has no environment 'intersection-v9' \(did you"),
-        (
-            {"highway.config.initial_vehicle_cout": 3},
-            r"highway\.config\.initial_vehicle_cout: unknown key \(did you mean",
-        ),
-        (
-            {"highway.config.initial_vehicle_count": "many"},
-            r"initial_vehicle_count: expected a value like 10, got 'many'",
-        ),
-        (
-            {"highway.config.policy_frequency": 5},
-            r"config\.policy_frequency: follows from rates\.decision; leave this out",
-        ),
+        ({"highway.config.initial_vehicle_cout": 3}, r"highway\.config\.initial_vehicle_cout: unknown key"),
         ({"highway.config.other_vehicles_type": "no.such.Class"}, "highway: intersection-v0 cannot be made"),
         ({"highway.config.vehicle": {"bool": [[1]]}}, r"^highway\.config\.vehicle: unknown key; allowed: "),
         ({"highway.config.observation": {"type": "Kinematics"}}, r"config\.observation: follows from \[observation\]"),
-        (
-            {"highway.config.centering_position": {"x": 1}},
-            r"centering_position: expected a value like \[0\.5, 0\.6\]",
-        ),
-        (
-            {"highway.id": "two-way-v0"},
-            r"highway\.id: two-way-v0 takes no speed .*: its rewards need discrete",
-        ),
-        ({"highway.id": "lane-keeping-v0"}, r"highway\.id: lane-keeping-v0 takes no speed and steering of vehicles"),
-        ({"highway.speed": 5}, r"highway\.speed: unknown key; allowed: config, dynamical, id, most_vehicles"),
+        ({"highway.config.centering_position": {"x": 1}}, r"centering_position: expected a value like \[0\.5, 0\.6\]"),
+        ({"highway.id": "two-way-v0"}, r"highway\.id: two-way-v0 takes no speed .*: its rewards need discrete"),
         ({"rates.camera": 12.5, "rates.decision": 12.5}, r"rates\.camera: highway-env steps a whole number"),
         ({"dynamics.wheelbase": 2.7}, r"dynamics\.wheelbase: highway-env has its own; allowed: max_acceleration"),
         ({"vehicles.0.initial_pose.position": [0.0, 0.0, 0.0]}, r"vehicles\.0\.initial_pose: highway-env draws it"),
-        ({"vehicles.3.motion.initial_speed": 3.0}, r"vehicles\.3\.motion\.initial_speed: highway-env draws it"),
         ({"vehicles.0.motion": {"kind": "static"}}, r"vehicles\.0\.motion\.kind: 'static' is not known to highway-env"),
         ({"vehicles": [{"motion": {"kind": "traffic"}}]}, "vehicles: highway-env needs at least one that is driven"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(overrides: dict[str, Any], why: str) -> None:
+def test_mistakes_are_one_line(overrides: dict[str, Any], why: str) -> None:
     with pytest.raises(CoopenvError, match=why):
         coopenv.parallel_env(CROSSING, overrides=overrides)
 
 
-def test_what_is_missing_shows_when_it_begins() -> None:
+def test_missing_vehicles_are_named_at_the_reset() -> None:
     two = [{"motion": {"kind": "driven"}}] * 2
     crowd = [{"motion": {"kind": "driven"}}] + [{"motion": {"kind": "traffic"}}] * 9
     for name, overrides, why in (
@@ -310,7 +290,7 @@ def test_states_of_others_are_refused() -> None:
     assert np.array_equal(env.engine.view("position"), other.engine.view("position"))
 
 
-def test_its_roads_are_drawn() -> None:
+def test_roads_are_drawn() -> None:
     env = coopenv.parallel_env(ROUNDABOUT, render_mode="rgb_array")
     roads = env.scenario.roads
     assert len(roads) > 50 and not any(road.marked for road in roads)
@@ -324,7 +304,7 @@ def test_its_roads_are_drawn() -> None:
 
 
 @pytest.mark.parametrize(("name", "speed", "seed"), [(CROSSING, 10.0, 4), (ROUNDABOUT, 6.0, 1)])
-def test_its_way_can_be_driven_by_what_is_observed(name: str, speed: float, seed: int) -> None:
+def test_the_route_can_be_driven_by_observations(name: str, speed: float, seed: int) -> None:
     env = coopenv.parallel_env(name, observation="dict", overrides={"horizon": 20.0, "termination.collision": False})
     ahead = 2.0 * env.scenario.observation.route_step
     top, widest = env.scenario.dynamics.max_speed, env.scenario.action.steering

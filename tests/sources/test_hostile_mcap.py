@@ -55,44 +55,33 @@ def put(key: str, value: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
     ("key", "value", "why"),
     [
         ("order", [5, 6, 7, 8, 9], r"order: \(5, 6, 7, 8, 9\) is no order of 0 \.\. 4"),
-        ("order", [-1, 0, 1, 2, 3], "order.0: Input should be greater than or equal to 0"),
         ("order", [1, 0, 2, 3, 4], "vehicles in another order than recorded"),
         ("dt", 0.0, "dt: 0.0 is not in 1e-05 .. 1000"),
-        ("dt", 1e308, r"recording.json: dt: Input should be less than or equal to"),
         ("dt", 0.5, r"scenario: ticks of 0.0166667 s, recorded 0.5 s"),
-        ("period", 0, "period: 0 is not in 1 .. 100000"),
         ("staleness", -1.0, "staleness: -1.0 is not positive"),
         ("ticks", 10**12, "tick|would need .* GiB of memory"),
         ("ticks", 6, "tick 6: the recording ends at tick 5"),
         ("ticks", 8, "tick 7 is missing"),
-        ("ticks", 0, "ticks: Input should be greater than or equal to 1"),
         ("setups", [], "setups: List should have at least 1 item"),
         ("setups.1.targets", [0, 99], "setups.1.targets: not different targets of 0 .. 7 without 4"),
-        ("setups.1.targets", [-5], "setups.1.targets.0"),
         ("setups.1.targets", [0], "vehicle_2 has other neighbours than in its setup"),
         ("setups.1.vehicle", 7, "setups.1.vehicle: 7 instead of 1"),
         ("setups.1.name", "vehicle_1", "topic '/vehicle_1|name"),
-        ("setups.1.landmarks", 99, "setups.1: other names, landmarks"),
         ("setups.0.landmarks", 99, "cannot reshape|not as many names"),
         ("setups.0.target_names", ["a"] * 8, "two targets have the same name"),
         ("setups.0.target_names.0", "a b", "is no name"),
         ("setups.0.planar", True, "setups.1: other names, landmarks or plane"),
         ("setups.2.gains.k", 0.5, "setups.2.gains.k: 0.5 is not in 0.5"),
         ("setups.2.gains.q", [1.0], "setups.2.gains.q: not 8 positive numbers"),
-        ("setups.2.noise.velocity", -1.0, "setups.2.noise.velocity: -1.0 is not in"),
         ("setups.2.noise.odometry_period", 0.0, "odometry_period: 0.0 is not in"),
         ("setups.2.noise.image_axis", [1.0, 1.0, 0.0], "image_axis: not a unit vector"),
         ("start_rotation.0", np.diag([1.0, 1.0, -1.0]).tolist(), "start_rotation of vehicle_1: not a rotation"),
         ("start_rotation", [], r"start_rotation: expected an array of shape \(5, 3, 3\) .* got float64"),
         ("start_covariance.3", np.zeros((6, 6)).tolist(), "start_covariance of vehicle_4: not a symmetric"),
-        ("start_covariance.3", np.tri(6).tolist(), "start_covariance of vehicle_4"),
         ("start_position.3.1", 1e300, "start_position.3.1: Input should be less than or equal to"),
-        ("start_position.3.1", "here", "start_position.3.1: Input should be a valid number, got 'here'"),
-        ("scenario.vehicles", [], "scenario|vehicles"),
         ("scenario.rates.camera", 30.0, "scenario: ticks of 0.0333333 s"),
         ("scenario.rates.observer", 20.0, "scenario: corrections due at other ticks"),
         ("scenario.v2x.period", 3, "scenario: another radio"),
-        ("scenario.topology.acyclic", "x" * 3000, "should be a valid boolean, got 'xxx"),
     ],
 )
 def test_headers(key: str, value: Any, why: str, written: Path, tmp_path: Path) -> None:
@@ -103,7 +92,7 @@ def test_headers(key: str, value: Any, why: str, written: Path, tmp_path: Path) 
 
 @pytest.mark.parametrize("number", ["NaN", "1e999"])
 @pytest.mark.parametrize("key", ["dt", "setups.0.gains.k", "start_position.0.0"])
-def test_numbers_that_are_none(number: str, key: str, written: Path, tmp_path: Path) -> None:
+def test_non_finite_numbers(number: str, key: str, written: Path, tmp_path: Path) -> None:
     import json
 
     def change(facts: dict[str, Any]) -> bytes:
@@ -141,7 +130,7 @@ def test_a_scenario_of_others(written: Path, tmp_path: Path) -> None:
         (b'{"ticks": 1' + b"0" * 6000 + b"}", "recording.json"),
     ],
 )
-def test_headers_that_are_none(text: bytes, why: str, written: Path, tmp_path: Path) -> None:
+def test_invalid_headers(text: bytes, why: str, written: Path, tmp_path: Path) -> None:
     edit(written, tmp_path / "hostile.mcap", header=lambda facts: text)
     refused(tmp_path / "hostile.mcap", why)
 
@@ -183,21 +172,9 @@ def ending(number: np.generic) -> Callable[[bytes], bytes]:
         ("/vehicle_3/bearings", lambda d: d[:-9], r"/vehicle_3/bearings, tick 0: "),
         ("/vehicle_3/bearings", lambda d: d[:16] + b"\xff\xff\xff\xff" + d[20:], r"/vehicle_3/bearings, tick 0: "),
         ("/vehicle_1/v2x", lambda d: d[:-8], r"/vehicle_1/v2x, tick 0: "),
-        (
-            "/vehicle_1/increment",
-            ending(np.float64(np.nan)),
-            "angular_velocity of vehicle_1, tick 0",
-        ),
-        (
-            "/vehicle_1/increment",
-            ending(np.float64(1e300)),
-            "angular_velocity of vehicle_1, tick 0",
-        ),
-        (
-            "/vehicle_1/truth_exact",
-            ending(np.float64(np.inf)),
-            "truth.position of vehicle_1, tick 0",
-        ),
+        ("/vehicle_1/increment", ending(np.float64(np.nan)), "angular_velocity of vehicle_1, tick 0"),
+        ("/vehicle_1/increment", ending(np.float64(1e300)), "angular_velocity of vehicle_1, tick 0"),
+        ("/vehicle_1/truth_exact", ending(np.float64(np.inf)), "truth.position of vehicle_1, tick 0"),
         ("/vehicle_1/v2x", ending(np.int64(9)), "inbox_tick of vehicle_1, tick 0: not -1"),
         ("/vehicle_1/v2x", ending(np.int64(-7)), "inbox_tick of vehicle_1, tick 0: not -1"),
         ("/vehicle_2/bearings", lambda d: d[:-24] + np.ones(3).tobytes(), "bearings of vehicle_2, tick 0: not unit"),
@@ -211,7 +188,7 @@ def test_messages(topic: str, change: Callable[[bytes], bytes], why: str, writte
     refused(tmp_path / "hostile.mcap", why)
 
 
-def test_rotations_that_are_none(written: Path, tmp_path: Path) -> None:
+def test_invalid_rotations(written: Path, tmp_path: Path) -> None:
     def scaled(m: Sent) -> Iterable[Sent]:
         if (m.topic, m.tick) != ("/vehicle_4/truth_exact", 3):
             return [m]
@@ -275,7 +252,7 @@ def test_many_chunks_that_unpack_to_much(written: Path, tmp_path: Path, monkeypa
     refused(more, r"would unpack to 9437184, more than [89]\d{6}\b")  # the limit is for both
 
 
-def test_a_chunk_that_is_not_what_it_says(written: Path, tmp_path: Path) -> None:
+def test_a_chunk_of_another_size_than_stated(written: Path, tmp_path: Path) -> None:
     path = tmp_path / "hostile.mcap"
     bomb(written, path, 2**20, claimed=2**20 + 1)
     refused(path, "a chunk unpacks to 1048576 bytes, not to the stated 1048577")
@@ -305,7 +282,7 @@ def test_replays_check_what_they_are_given(written: Path) -> None:
             Replay(replace(good, **change), "drive")
 
 
-def test_what_could_not_be_read_is_not_written(tmp_path: Path) -> None:
+def test_unreadable_recordings_are_not_written(tmp_path: Path) -> None:
     made = simulated("crossing_path", horizon=0.1)
     with pytest.raises(DataError, match=r"^recording: dt: nan is not in"):
         write_recording(replace(made, dt=float("nan")), tmp_path / "drive.mcap")

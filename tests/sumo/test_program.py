@@ -191,9 +191,7 @@ def test_a_city_that_begins_in_the_morning(city: Path, tmp_path: Path) -> None:
     engine = engine_of(city, sumo__net=str(tmp_path / "city.sumocfg"), sumo__routes=[str(tmp_path / "late.rou.xml")])
     engine.reset([1])
     assert engine.world.scenario.sumo.begin == 25200.0 and poses_of(engine)[:, 3].all()
-    with pytest.raises(
-        CoopenvError, match=r"SUMO has 0 after .*; the first of 1\d\d departs at 25,205 s, .* = 25205, or"
-    ):
+    with pytest.raises(CoopenvError, match=r"SUMO has 0 after .*; the first of 1\d\d departs at 25,205 s, .* = 25205"):
         engine_of(city, sumo__routes=[str(tmp_path / "late.rou.xml")]).reset([1])
 
 
@@ -258,7 +256,7 @@ def test_the_end_of_sumo_is_one_line_and_the_next_reset_begins_anew() -> None:
         env.step({agent: np.zeros(2) for agent in env.agents})
 
 
-def test_its_process_ends_with_the_program_that_has_started_it() -> None:
+def test_sumo_ends_with_the_program_that_has_started_it() -> None:
     code = (
         "import coopenv, os; env = coopenv.parallel_env('sumo_crossing'); env.reset(seed=0);"
         "print(env.engine.world.programs[0]._process.pid, flush=True); os._exit(0)"
@@ -290,13 +288,13 @@ def test_its_process_ends_with_the_program_that_has_started_it() -> None:
         ({"sumo.most_vehicles": 0}, r"sumo\.most_vehicles: 0 are too few, there are 2 on the road"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(overrides: dict[str, Any], why: str) -> None:
+def test_mistakes_are_one_line(overrides: dict[str, Any], why: str) -> None:
     with pytest.raises(CoopenvError, match=why) as caught:
         coopenv.parallel_env(CROSSING, overrides=overrides).reset(seed=0)
     assert "\n" not in str(caught.value)
 
 
-def test_without_sumo_one_line_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_sumo_one_line_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("coopenv.sumo.program.find_spec", lambda name: None)
     with pytest.raises(CoopenvError, match=r"^backend 'sumo' needs SUMO, which is not installed: pip install"):
         coopenv.parallel_env(CROSSING)

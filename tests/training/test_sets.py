@@ -108,7 +108,7 @@ def test_the_trained_environment_is_left_out() -> None:
     ("environment", "overrides"),
     [("facade", {}), ("lighthouse", {"observation.map_size": 9}), ("open_square", {"observation.map_scale": 20.0})],
 )
-def test_it_drives_anywhere(folder: Path, environment: str, overrides: dict[str, object]) -> None:
+def test_the_driver_drives_anywhere(folder: Path, environment: str, overrides: dict[str, object]) -> None:
     scenario = load_scenario(environment, overrides)
     policy, engine = load_agent(folder, scenario), Engine(scenario, 3)
     engine.reset([1, 2, 3])
@@ -132,7 +132,7 @@ def test_other_weights_are_refused(folder: Path) -> None:
         SavedSetDriver(load_scenario("facade"), folder=foreign.folder, network=other)
 
 
-def test_what_is_not_possible_is_refused(tmp_path: Path) -> None:
+def test_impossible_settings_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CoopenvError, match=r"--onnx: not with network = 'sets'"):
         train(PLAN, tmp_path / "agent", onnx=True)
     clone = Clone(agent="look_ahead", elsewhere=("nowhere",))

@@ -58,7 +58,7 @@ def test_defaults() -> None:
     assert settings.clone is None
 
 
-def test_a_training_of_which_nothing_is_said_begins_as_the_planner_where_that_can_drive() -> None:
+def test_by_default_a_training_begins_as_the_planner_if_that_can_drive() -> None:
     settings = usual_settings("open_square", {}, steps=None)
     shipped = read_settings(data_directory("agents") / "train.toml", "quality", "open_square")
     assert settings.right_of_way and settings.evaluation.every == settings.steps // 8
@@ -158,10 +158,7 @@ def test_a_plan_survives_as_plain_data(path: Path) -> None:
         ("start = 'mine'\nclone.agent = 'peek'", r"a training begins as an agent or as a \[clone\], give one of them"),
         ("scenario = 3", r"train\.toml: scenario: expected a table"),
         ("[environments.facade]\narms = 3", r"train\.toml: environments\.facade\.arms: expected tables by name"),
-        ("arms = 3", r"train\.toml: arms: expected tables by name"),
-        ("steps = ", r"train\.toml: not valid TOML"),
         ("network = 'sets'", r"'sets' learns by a clone alone: set clone\.agent and steps = 0"),
-        ("network = 'sets'\nsteps = 9\nclone.agent = 'peek'", r"'sets' learns by a clone alone"),
         ("steps = 0\nclone = { agent = 'peek', elsewhere = ['facade'] }", r"clone\.elsewhere: only with network = 'se"),
         ("network = 'graph'", r"network: .*'sets'"),
         ("steps = 0", r"steps: 0 is for a clone alone"),
@@ -228,7 +225,7 @@ def finish(folder: Path, plan: TrainingPlan) -> None:
     (folder / "agent.toml").write_text(f'[training]\nsettings = "{settings_digest(plan)}"\n')
 
 
-def test_what_the_user_wrote_stays_byte_for_byte(old: Path, new: Path) -> None:
+def test_settings_of_the_user_stay_byte_for_byte(old: Path, new: Path) -> None:
     write_settings(new, old, plan_of(old), HERE)
     assert (new / "train.toml").read_bytes() == (old / "train.toml").read_bytes()
 
@@ -251,7 +248,7 @@ def test_overrides_are_among_the_settings_and_what_cannot_be_read_is_the_users(o
         check_settings(old, plan, HERE)
 
 
-def test_those_of_an_agent_that_is_replaced_are_replaced(old: Path, new: Path) -> None:
+def test_settings_of_a_replaced_agent_are_replaced(old: Path, new: Path) -> None:
     plan = plan_of(old)
     finish(new, plan)
     assert read_settings(new / "train.toml") == plan.settings
@@ -262,7 +259,7 @@ def test_those_of_an_agent_that_is_replaced_are_replaced(old: Path, new: Path) -
     assert read_settings(newer / "train.toml") == other.settings
 
 
-def test_those_of_an_agent_are_the_users_once_changed_and_of_before_the_digest_are_not(old: Path, new: Path) -> None:
+def test_settings_of_an_agent_are_the_user_s_once_changed(old: Path, new: Path) -> None:
     plan, other = plan_of(old), plan_of(old, steps=10)
     finish(new, plan)
     with (new / "train.toml").open("a") as file:

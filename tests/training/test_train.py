@@ -158,7 +158,7 @@ def test_killed_and_resumed_learns_the_same(here: Path, reference: Path) -> None
 
 
 @pytest.mark.slow
-def test_what_else_was_to_be_written_is_written_after_resuming(here: Path) -> None:
+def test_further_files_are_written_after_resuming(here: Path) -> None:
     pytest.importorskip("onnx", reason="needs the extra 'onnx'")
     killed(here, fresh("--onnx", "--logs", "logs"))
     before = len(list((here / "logs").glob("events.*")))
@@ -169,7 +169,7 @@ def test_what_else_was_to_be_written_is_written_after_resuming(here: Path) -> No
 
 
 @pytest.mark.slow
-def test_a_training_that_diverges_says_so_and_keeps_its_checkpoint(
+def test_a_training_that_diverges_ends_in_one_line_and_keeps_its_checkpoint(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (here / "train.toml").write_text(SETTINGS.replace("[ppo]", "[ppo]\nlearning_rate = 1e9"))
@@ -212,7 +212,7 @@ def test_worlds_of_highway_env_begin_anew_where_a_killed_training_goes_on(here: 
     load_agent(here / "agent", coopenv.load_scenario("highway_roundabout"))
 
 
-def test_interrupted_says_how_to_go_on(here: Path) -> None:
+def test_an_interrupted_training_names_its_checkpoint(here: Path) -> None:
     process = begun(here, fresh())
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
@@ -282,10 +282,7 @@ def test_an_environment_that_changed_since(here: Path, capsys: pytest.CaptureFix
         (["train", "overtaking"], "all motion is prescribed or has a driver, there is nothing to learn"),
         (["train", "urban_crossing", "--from", "peek"], "start: peek is no policy that PPO learns"),
         (["train", "urban_crossing", "--from", "facade_quality"], "it was trained with another observation"),
-        (
-            ["train", "urban_crossing", "--agent", "route_follower"],
-            "--agent route_follower: there is no train.toml beside it",
-        ),
+        (["train", "urban_crossing", "--agent", "route_follower"], "--agent route_follower: there is no train.toml"),
         (["train", "urban_crossing", "--agent", "route_follower", "--settings", "train.toml"], "give one of them"),
         (["train", "urban_crossing", "--arm", "x"], "no arm 'x'; known: none"),
         (
@@ -428,7 +425,7 @@ def test_a_clone_that_learning_makes_worse_is_kept(here: Path, monkeypatch: pyte
     assert ranking.notes == ("Kept: the policy after 0 steps, the best in the worlds for validation",)
 
 
-def test_minutes_stop_a_training_and_say_so(here: Path) -> None:
+def test_minutes_stop_a_training_with_a_note(here: Path) -> None:
     _, ranking = trained(here, SETTINGS, minutes=1e-6)
     assert ranking.notes == ("Stopped by --minutes 1e-06 after 400 of 3,000 steps: another load gives another agent",)
 

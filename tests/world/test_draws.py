@@ -117,7 +117,7 @@ def test_landmarks_are_there_with_a_probability() -> None:
         assert_array_equal(seen, sight["present"][:, :2] == 1)
 
 
-def test_who_is_absent_hides_nothing_and_is_no_obstacle() -> None:
+def test_absent_agents_hide_nothing_and_are_no_obstacles() -> None:
     wall = landmark("wall", (2.0, 0.0, 0.5), body={"size": [0.5, 3.0, 2.0]}, presence=0.5)
     behind = landmark("behind", (4.0, 0.0, 0.5))
     inside = vehicle((2.0, 0.0, 0.5), body={"size": [0.5, 0.3, 0.3]}, presence=0.5)

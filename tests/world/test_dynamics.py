@@ -296,5 +296,5 @@ def test_the_first_entry_spans_the_speeds() -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_what_is_not_finite_counts_as_zero(bad: float) -> None:
+def test_actions_that_are_not_finite_count_as_zero(bad: float) -> None:
     assert_allclose(asked([(bad, bad)]), asked([(0.0, 0.0)]))

@@ -120,7 +120,9 @@ def test_levels_are_the_longest_chains_of_messages() -> None:
         (65536, 5, "cuda:0", None, (1, 1)),
     ],
 )
-def test_what_is_split(worlds: int, vehicles: int, device: str, threads: int | None, expected: tuple[int, int]) -> None:
+def test_threads_and_lanes_of_batches(
+    worlds: int, vehicles: int, device: str, threads: int | None, expected: tuple[int, int]
+) -> None:
     assert threads_and_lanes(worlds, vehicles, device, threads) == expected
 
 

@@ -243,8 +243,10 @@ def overlap_by_corners(a: tuple[np.ndarray, ...], b: tuple[np.ndarray, ...]) -> 
     return bool(any(inside))
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize(("vehicles", "landmarks", "buildings", "across"), [(4, 8, 12, 1), (60, 20, 40, 16)])
+@pytest.mark.parametrize(
+    ("seed", "vehicles", "landmarks", "buildings", "across"),
+    [(0, 4, 8, 12, 1), (1, 4, 8, 12, 1), (2, 4, 8, 12, 1), (1, 60, 20, 40, 16)],
+)
 def test_sights_and_contacts_are_those_of_all_pairs(
     seed: int, vehicles: int, landmarks: int, buildings: int, across: int
 ) -> None:

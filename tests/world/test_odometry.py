@@ -312,7 +312,7 @@ def test_off_draws_nothing() -> None:
     assert same_bits(silent["increment_rotation"], default["increment_rotation"])
 
 
-def test_their_truth_is_marked_as_truth() -> None:
+def test_systematic_errors_are_truth() -> None:
     env = CooperativeLocalisationEnv(scenario([vehicle(motion=TURNING)], noise=ALL, camera=MISPLACED), "test")
     _, infos = env.reset(seed=1)
     truth, state = infos["vehicle_1"]["truth"], env.state()

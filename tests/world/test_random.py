@@ -225,7 +225,7 @@ def test_nees_of_other_coordinates_is_that_of_the_observer_anywhere(
     assert_allclose(of_quality(nees, "float64", *arguments), expected, rtol=0.01 if away else 2e-6)
 
 
-def test_nees_by_hand() -> None:
+def test_nees_of_a_diagonal_covariance() -> None:
     """10 degrees too far about z at the origin, and 0.3 m off in y."""
     turn = Rotation.from_euler("z", np.radians(10)).as_matrix()
     P = np.diag([1.0, 1.0, 0.01, 1.0, 0.09, 1.0])
@@ -278,7 +278,7 @@ def expected(samples: list[tuple[float, float, np.ndarray]], length: float) -> f
     return float(np.linalg.eigvalsh(sum(w * G for w, G in kept) / sum(w for w, _ in kept))[0])
 
 
-def test_it_is_the_mean_over_the_last_metres() -> None:
+def test_the_windowed_gramian_is_the_mean_over_the_last_metres() -> None:
     engine = engine_of(observer__gramian_distance=1.0)
     landmarks = engine.world.model.landmarks
     rng, samples, way = np.random.default_rng(0), [], 0.0

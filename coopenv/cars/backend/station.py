@@ -7,11 +7,14 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.clock import CLOCK, Clock
-from coopenv.cars.gate import ARM, BOOL, COMMAND, STATUS, GateMode, Malformed, Reason, read, write, write_drive
-from coopenv.cars.keys import Signer, Verifier
-from coopenv.cars.profile import NEUTRAL, SVEA, CarProfile, Limits, Role
-from coopenv.cars.transport import MOST_BYTES, Arrival, Transport
+from coopenv.cars.gate.gate import ARM, BOOL, COMMAND, MOST_AHEAD, STATUS, GateMode, Reason
+from coopenv.cars.gate.wheel_command import NEUTRAL, write_drive
+from coopenv.cars.link.clock import CLOCK, Clock
+from coopenv.cars.link.keys import Signer, Verifier
+from coopenv.cars.link.transport import MOST_BYTES, Arrival, Transport
+from coopenv.cars.messages.cdr import Malformed, read, write
+from coopenv.cars.settings.limits import Limits
+from coopenv.cars.settings.profile import SVEA, CarProfile, Role
 
 MOST_WAITING = 256
 """Messages of one topic that wait for the next tick; older ones are dropped, so that a flood fills nothing."""
@@ -144,7 +147,7 @@ class Pacer:
 PATIENCE = 1.0  # s for a gate to answer
 RETRY = 0.05  # s between armings
 STATUS_TIME = 0.5  # s for a new status of every gate
-LATE, AHEAD = 500_000_000, 50_000_000  # ns by which a status may be old, or ahead of this clock
+LATE = 500_000_000  # ns by which a status may be old
 OLD = 1.0  # s without a status after which a gate counts as gone
 OPEN = ("armed", "timed_out")
 """States of a gate that takes commands: after a time-out the car stands until the next one."""
@@ -228,7 +231,7 @@ class Gates:
         except (Malformed, ValueError):
             self.dropped[car]["malformed"] += 1
             return
-        if not -AHEAD <= arrival.received - stamp <= LATE:
+        if not -MOST_AHEAD <= arrival.received - stamp <= LATE:
             self.dropped[car]["stale" if stamp < arrival.received else "future"] += 1
             return
         counts = Counter(dict(zip(reasons, numbers, strict=False)))

@@ -13,10 +13,11 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.station import BYPASSED, OLD, OPEN, Gates, Station
-from coopenv.cars.deployment import Safety
-from coopenv.cars.gate import Reason
-from coopenv.cars.profile import Role, inside, presence_of
-from coopenv.cars.readings import CarPose, Sample
+from coopenv.cars.gate.gate import Reason
+from coopenv.cars.messages.readings import CarPose, Sample
+from coopenv.cars.settings.deployment import Safety
+from coopenv.cars.settings.limits import inside
+from coopenv.cars.settings.profile import Role, presence_of
 from coopenv.estimation.poses import Array, skew
 from coopenv.observers.contract import Message
 from coopenv.sources.base import VehicleBroadcast

@@ -20,8 +20,8 @@ from coopenv.cars.bags.files import check_extra
 from coopenv.cars.bags.log import read_log
 from coopenv.cars.bags.topic_map import UNNEEDED, TopicMap, load_map
 from coopenv.cars.bags.topics import NS
-from coopenv.cars.profile import Role
-from coopenv.cars.readings import CarPose, Sample
+from coopenv.cars.messages.readings import CarPose, Sample
+from coopenv.cars.settings.profile import Role
 from coopenv.estimation.poses import MISFIT_DEG
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.sources.base import Capabilities, Episode, TickGenerator

@@ -22,8 +22,8 @@ from scipy.stats import theilslopes
 
 from coopenv.cars.backend.binding import Binding, marker_places
 from coopenv.cars.bags.topic_map import TRUTH, Chosen
-from coopenv.cars.profile import Role
-from coopenv.cars.readings import Sample, sightings_of, tracks_of
+from coopenv.cars.messages.readings import Sample, sightings_of, tracks_of
+from coopenv.cars.settings.profile import Role
 from coopenv.estimation.poses import Array, about_z, bearing_misfit_deg
 
 Times = NDArray[np.int64]

@@ -16,7 +16,7 @@ from rosbags.serde.utils import SIZEMAP
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars import codec
+from coopenv.cars.messages import codec
 
 CDR, ROS1 = "cdr", "ros1"
 """Encodings of messages that are read."""

@@ -28,13 +28,13 @@ from coopenv.cars.bags.clocks import Delay, Leads, checked, jumps, leads_of, mov
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TRUTH, Chosen, ClockSettings, MapFrame, TopicMap, select
 from coopenv.cars.bags.topics import NS, TopicRow, regularity, unread_truth
-from coopenv.cars.codec import encode, stamp_of
-from coopenv.cars.gate import read_drive
-from coopenv.cars.profile import Role
-from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, read
-from coopenv.cars.sensor_settings import Correction
-from coopenv.cars.turning import turn_contradiction
-from coopenv.cars.vision import Calibration
+from coopenv.cars.bags.turning import turn_contradiction
+from coopenv.cars.gate.wheel_command import read_drive
+from coopenv.cars.messages.codec import encode, stamp_of
+from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.profile import Role
+from coopenv.cars.settings.sensors import Correction
 from coopenv.scenario.sensing import rotation_of
 
 IMU = "sensor_msgs/msg/Imu"
@@ -129,9 +129,7 @@ def value_reader(
         if isinstance(value, CarPose):
             return in_frame(value, frames.get(entry.role, given.frames.map))
         if isinstance(value, Twist):
-            value = given.corrections.get(entry.car, right).twist(value)
-            if entry.role is Role.WHEEL and entry.car in turning:
-                return Twist(value.linear, None)  # the IMU knows better
+            return given.corrections.get(entry.car, right).twist(value, entry.role, entry.car in turning)
         return value
 
     return read_value

@@ -11,21 +11,20 @@ from pydantic import Field, model_validator
 
 from coopenv.base.errors import CoopenvError, DataError, check_one_of, listed, suggest
 from coopenv.base.sections import Section, read_toml, validated, with_tables
-from coopenv.cars.deployment import Car, Marker, refuse_repeated
-from coopenv.cars.profile import (
+from coopenv.cars.messages.readings import READERS
+from coopenv.cars.settings.deployment import Car, Marker, refuse_repeated
+from coopenv.cars.settings.limits import Number, Positive
+from coopenv.cars.settings.profile import (
     AUTHORS,
     PREFIX,
     SVEA,
     VELOCITY,
     CarProfile,
-    Number,
-    Positive,
     Role,
     VisionSettings,
     load_profile,
 )
-from coopenv.cars.readings import READERS
-from coopenv.cars.sensor_settings import Correction, Name, TopicName, read_calibration
+from coopenv.cars.settings.sensors import Correction, Name, TopicName, read_calibration
 
 PATTERNS: dict[str, dict[Role, tuple[str, ...]]] = {
     "authors": {role: tuple(f"/{name}" for name in names) for role, names in AUTHORS.items()},

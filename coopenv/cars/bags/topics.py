@@ -14,10 +14,10 @@ from coopenv.cars.backend.assembler import BROADCAST
 from coopenv.cars.bags.clocks import checked
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import READ, Chosen, TopicMap
-from coopenv.cars.profile import IMAGES, SVEA, VELOCITY, Role
-from coopenv.cars.readings import POSES, READERS, read
-from coopenv.cars.sensor_settings import TOPIC
-from coopenv.cars.vision import Calibration
+from coopenv.cars.messages.readings import POSES, READERS, read
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.profile import IMAGES, SVEA, VELOCITY, Role
+from coopenv.cars.settings.sensors import TOPIC
 
 NS = 1_000_000_000
 

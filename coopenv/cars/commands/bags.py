@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from coopenv.cars.bags.topics import TopicRow
-    from coopenv.cars.calibration import Calibrated, ConstantRow
+    from coopenv.cars.calibration.calibrate import Calibrated, ConstantRow
 
 in_bags = partial(typer.Argument, metavar="BAG...", callback=arguments.existing("bag"))
 
@@ -131,10 +131,10 @@ def calibrate(
     """Estimate cameras, odometry, clocks and markers of cars from one drive, and print which constants are wrong."""
     from coopenv.base.files import check_file, new_folder, replace_text
     from coopenv.cars.bags.bag import open_bags
-    from coopenv.cars.calibration import calibrate as calibrated
-    from coopenv.cars.calibration import toml_text
-    from coopenv.cars.calibration_drives import drive_of_bag, drive_of_recording
-    from coopenv.cars.calibration_figure import residual_figure
+    from coopenv.cars.calibration.calibrate import calibrate as calibrated
+    from coopenv.cars.calibration.calibrate import toml_text
+    from coopenv.cars.calibration.drives import drive_of_bag, drive_of_recording
+    from coopenv.cars.calibration.figure import residual_figure
     from coopenv.runs.console import Progress
     from coopenv.sources.registry import kind_of
     from coopenv.sources.sources import open_recording
@@ -190,8 +190,8 @@ def identify(
     """
     from coopenv.base.files import check_file, replace_text
     from coopenv.cars.bags.bag import open_bags
-    from coopenv.cars.identify import identify as identified
-    from coopenv.cars.identify import toml_text
+    from coopenv.cars.calibration.identify import identify as identified
+    from coopenv.cars.calibration.identify import toml_text
     from coopenv.runs.console import Progress, number_table
 
     check_file(out)

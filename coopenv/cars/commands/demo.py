@@ -21,8 +21,8 @@ from coopenv.base.interrupts import also_kept
 from coopenv.cars.backend.backend import Svea, open_svea
 from coopenv.cars.fake.fleet import fakes
 from coopenv.cars.fake.lockstep import LockstepFakes
-from coopenv.cars.profile import Role
-from coopenv.cars.zenoh import library
+from coopenv.cars.link.zenoh import library
+from coopenv.cars.settings.profile import Role
 from coopenv.estimation.metrics import live_ticks, summarise
 from coopenv.runs.command import execute, report
 from coopenv.runs.console import Progress, compile_notice, number_table

@@ -19,9 +19,11 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cli import arguments, commands, options
 
 if TYPE_CHECKING:
-    from coopenv.cars.transport import Transport
+    from coopenv.cars.link.transport import Transport
 
 in_deployment = partial(typer.Argument, metavar="DEPLOYMENT.toml", callback=arguments.existing("deployment"))
+Fleet = Annotated[Path, in_deployment(help="Deployment of the fleet.")]
+CarName = Annotated[str, typer.Option(help="Name of the car, as in the deployment.")]
 GateConnect = Annotated[
     str | None,
     typer.Option(
@@ -95,8 +97,8 @@ def demo(
 
 @svea.command()
 def fake(
-    deployment: Annotated[Path, in_deployment(help="Deployment of the fleet.")],
-    car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
+    deployment: Fleet,
+    car: CarName,
     seed: options.Seed = 0,
     fault: Annotated[
         list[str] | None,
@@ -113,10 +115,10 @@ def fake(
 ) -> None:
     """Let a fake car drive, see and send until it is interrupted; a line marks when it is ready."""
     from coopenv.base import interrupts
-    from coopenv.cars.deployment import load_deployment
     from coopenv.cars.fake.fleet import prepare_fake, run
     from coopenv.cars.fake.settings import fake_fault
-    from coopenv.cars.zenoh import open_transport
+    from coopenv.cars.link.zenoh import open_transport
+    from coopenv.cars.settings.deployment import load_deployment
 
     faults = [fake_fault(text) for text in fault or ()]
     make = prepare_fake(deployment, car, gate, station)
@@ -166,9 +168,9 @@ def gate(
     Limits beyond those of the make are refused: for SVEA 1.53 m/s, 0.5236 rad, 2 m/s^2 and 4 rad/s.
     """
     from coopenv.base import interrupts
-    from coopenv.cars.clock import CLOCK
-    from coopenv.cars.gate_process import gate_deployment, prepare_gate, run
-    from coopenv.cars.zenoh import open_transport
+    from coopenv.cars.gate.process import gate_deployment, prepare_gate, run
+    from coopenv.cars.link.clock import CLOCK
+    from coopenv.cars.link.zenoh import open_transport
 
     bounds = {"speed": max_speed, "steering": max_steering, "acceleration": max_acceleration}
     fleet = gate_deployment(car, deployment, connect, off_board)
@@ -188,8 +190,8 @@ def gate(
 
 @svea.command()
 def health(
-    deployment: Annotated[Path, in_deployment(help="Deployment of the fleet.")],
-    car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
+    deployment: Fleet,
+    car: CarName,
     connect: GateConnect = None,
     off_board: OffBoard = False,
     patience: Annotated[float, typer.Option(min=0.1, help="Longest wait for it, s.")] = 2.0,
@@ -207,12 +209,12 @@ def health(
     """
     from coopenv.base.installation import install_command, needing
     from coopenv.cars.backend.station import BYPASSED, UNTRIED, Gates, neutral_command
-    from coopenv.cars.deployment import load_deployment
-    from coopenv.cars.gate import Reason
-    from coopenv.cars.gate_process import gate_deployment
-    from coopenv.cars.keys import load_verifier
-    from coopenv.cars.transport import UNIX, LinkError
-    from coopenv.cars.zenoh import open_transport
+    from coopenv.cars.gate.gate import Reason
+    from coopenv.cars.gate.process import gate_deployment
+    from coopenv.cars.link.keys import load_verifier
+    from coopenv.cars.link.transport import UNIX, LinkError
+    from coopenv.cars.link.zenoh import open_transport
+    from coopenv.cars.settings.deployment import load_deployment
 
     fleet = gate_deployment(car, deployment, connect, off_board)
     verifier = None if fleet.keys is None else load_verifier(fleet.keys)
@@ -258,8 +260,8 @@ def health(
 
 def next_message(transport: "Transport", topic: str, kind: str, patience: float) -> Any | None:
     """Return the next message of a topic that is of a type (None: none within s); whatever else comes is dropped."""
-    from coopenv.cars.codec import decode
-    from coopenv.cars.transport import Arrival
+    from coopenv.cars.link.transport import Arrival
+    from coopenv.cars.messages.codec import decode
 
     received = Queue[Any](1)
 
@@ -275,8 +277,8 @@ def next_message(transport: "Transport", topic: str, kind: str, patience: float)
 
 @svea.command()
 def see(
-    deployment: Annotated[Path, in_deployment(help="Deployment of the fleet.")],
-    car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
+    deployment: Fleet,
+    car: CarName,
     connect: GateConnect = None,
     off_board: OffBoard = False,
     patience: Annotated[float, typer.Option(min=0.1, help="Longest wait for the calibration of its camera, s.")] = 5.0,
@@ -287,12 +289,12 @@ def see(
     messages of other detectors are read as well.
     """
     from coopenv.base import interrupts
-    from coopenv.cars.gate_process import gate_deployment
-    from coopenv.cars.profile import Role
-    from coopenv.cars.readings import read
-    from coopenv.cars.see import FrameReader
-    from coopenv.cars.vision import Calibration, opencv
-    from coopenv.cars.zenoh import open_transport
+    from coopenv.cars.gate.process import gate_deployment
+    from coopenv.cars.link.zenoh import open_transport
+    from coopenv.cars.messages.readings import read
+    from coopenv.cars.messages.see import FrameReader
+    from coopenv.cars.messages.vision import Calibration, opencv
+    from coopenv.cars.settings.profile import Role
 
     fleet = gate_deployment(car, deployment, connect, off_board)
     profile, topic = fleet.profile, fleet.profile.topic_of(car, Role.CAMERA_INFO)
@@ -326,13 +328,13 @@ def keys(
 
     Give each car its own NAME.pem and public.toml, by a trusted channel, and delete it here. Existing keys are kept.
     """
-    from coopenv.cars.keys import PUBLIC, make_keys
+    from coopenv.cars.link.keys import PUBLIC, make_keys
 
     if (deployment is None) == (names is None):
         raise CoopenvError("keys: name a deployment file, or identities with --names, and not both")
     folder, wanted = out or Path("keys"), [name.strip() for name in (names or "").split(",")]
     if deployment is not None:
-        from coopenv.cars.deployment import load_deployment
+        from coopenv.cars.settings.deployment import load_deployment
 
         read = load_deployment(deployment)
         wanted = [*(car.name for car in read.cars), read.security.identity]
@@ -358,7 +360,7 @@ def router(
 ) -> None:
     """Run a Zenoh router until it is interrupted; a line marks when it is ready."""
     from coopenv.base import interrupts
-    from coopenv.cars.zenoh import open_zenoh
+    from coopenv.cars.link.zenoh import open_zenoh
 
     endpoints = listen or ([] if config else ["tcp/127.0.0.1:7447"])
     with closing(open_zenoh("router", listen=endpoints, config=config)):
@@ -384,9 +386,9 @@ def attack(
     status is 1 where anything got through or a port is open. An armed fleet is refused. Gates are stopped afterwards
     if anything got through.
     """
-    from coopenv.cars.attack import Intruder, open_ports, plan, refuse_driven
-    from coopenv.cars.attack import attack as attacked
-    from coopenv.cars.deployment import load_deployment
+    from coopenv.cars.gate.attack import Intruder, open_ports, plan, refuse_driven
+    from coopenv.cars.gate.attack import attack as attacked
+    from coopenv.cars.settings.deployment import load_deployment
     from coopenv.runs.console import Progress, number_table
 
     fleet, log, out = load_deployment(deployment, connect), options.console(stderr=True), options.console()

@@ -14,17 +14,19 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
 from coopenv.cars.backend.binding import Binding
-from coopenv.cars.clock import Clock
-from coopenv.cars.codec import decode, pose, stamp_of, warm_up
 from coopenv.cars.fake.sensors import LEADER_RATE, TRUTH_RATE, Act, CarSensors, FakeCamera, SensorPublisher
 from coopenv.cars.fake.settings import USUAL, CarFaults, FakeSettings, Wire, end_process, fake_fault, fault_topic
 from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
-from coopenv.cars.gate import PERIOD, GateClock, Malformed, read_drive, write_drive
-from coopenv.cars.gate_process import GateConnection
-from coopenv.cars.profile import RESET_TOPIC, MotionCommand, Role, presence_of
-from coopenv.cars.readings import READERS, CarPose, Sample, read
-from coopenv.cars.transport import Callback, Transport
-from coopenv.cars.vision import Calibration
+from coopenv.cars.gate.gate import PERIOD, GateClock
+from coopenv.cars.gate.process import GateConnection
+from coopenv.cars.gate.wheel_command import MotionCommand, read_drive, write_drive
+from coopenv.cars.link.clock import Clock
+from coopenv.cars.link.transport import Callback, Transport
+from coopenv.cars.messages.cdr import Malformed
+from coopenv.cars.messages.codec import decode, pose, stamp_of, warm_up
+from coopenv.cars.messages.readings import READERS, CarPose, Sample, read
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.profile import RESET_TOPIC, Role, presence_of
 
 LATE = 50_000_000
 """ns: measurements that are overdue for longer than this are left out, as after a computer that stood still."""

@@ -17,9 +17,9 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.interrupts import WITH_INPUT, before_a_hard_end, held
 from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
-from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.fake.car import Fake
-from coopenv.cars.gate_process import prepare_gate
+from coopenv.cars.gate.process import prepare_gate
+from coopenv.cars.settings.deployment import Deployment, load_deployment
 
 READY = 300.0
 """Longest start of fakes, s: the first ones on a computer compile the simulation's kernels."""

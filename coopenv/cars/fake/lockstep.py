@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from coopenv.cars.backend.backend import Svea, open_svea
-from coopenv.cars.clock import CLOCK, Clock, SimulatedClock
 from coopenv.cars.fake.car import Fake
 from coopenv.cars.fake.fleet import fleet_of_fakes, prepare_fake
-from coopenv.cars.profile import Role
-from coopenv.cars.see import FrameReader
-from coopenv.cars.transport import Arrival, Callback, HeartbeatTransport, matcher
-from coopenv.cars.vision import Calibration
+from coopenv.cars.link.clock import CLOCK, Clock, SimulatedClock
+from coopenv.cars.link.transport import Arrival, Callback, HeartbeatTransport, matcher
+from coopenv.cars.messages.see import FrameReader
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.profile import Role
 
 
 class Hub:

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding
-from coopenv.cars.codec import encode, header, make, ros2
+from coopenv.cars.fake.frames import FrameRenderer, PlacedTag, facing, pattern
 from coopenv.cars.fake.settings import AHEAD, CarFaults, FakeSettings
 from coopenv.cars.fake.world import CarWorld, Neighbours
-from coopenv.cars.frames import FrameRenderer, PlacedTag, facing, pattern
-from coopenv.cars.profile import IMAGES, CarProfile, Role
-from coopenv.cars.see import object_bearings
-from coopenv.cars.transport import Transport
-from coopenv.cars.vision import Calibration, opencv, rays
+from coopenv.cars.link.transport import Transport
+from coopenv.cars.messages.codec import encode, header, make, ros2
+from coopenv.cars.messages.see import object_bearings
+from coopenv.cars.messages.vision import Calibration, opencv, rays
+from coopenv.cars.settings.profile import IMAGES, CarProfile, Role
 from coopenv.estimation.poses import Array
 from coopenv.scenario.sensing import Noise
 from coopenv.world.random import ODOMETRY_NOISE

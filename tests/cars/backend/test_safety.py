@@ -14,16 +14,17 @@ from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.buffers import StatusBoard
 from coopenv.cars.backend.station import LATE, Gates, Station
 from coopenv.cars.backend.watchdog import BEARING_STD, LinkMonitor, Watchdog, bearing_nis
-from coopenv.cars.clock import CLOCK, Clock, SimulatedClock
-from coopenv.cars.codec import encode, header, make
-from coopenv.cars.deployment import Remote, Safety
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.gate import Gate
-from coopenv.cars.gate_process import GateConnection
-from coopenv.cars.profile import SVEA, USUAL, Role
-from coopenv.cars.readings import CarPose, Sample, Twist
-from coopenv.cars.transport import Arrival
-from coopenv.cars.vision import Calibration
+from coopenv.cars.gate.gate import Gate
+from coopenv.cars.gate.process import GateConnection
+from coopenv.cars.link.clock import CLOCK, Clock, SimulatedClock
+from coopenv.cars.link.transport import Arrival
+from coopenv.cars.messages.codec import encode, header, make
+from coopenv.cars.messages.readings import CarPose, Sample, Twist
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.deployment import Remote, Safety
+from coopenv.cars.settings.limits import USUAL
+from coopenv.cars.settings.profile import SVEA, Role
 from coopenv.estimation.poses import exp_so3
 from coopenv.sources.base import VehicleBroadcast
 from tests.cars.backend.test_assembler import binding
@@ -61,7 +62,7 @@ def test_only_newer_messages_are_signs_of_life() -> None:
     assert monitor.age("car0", Role.IMU) == float("inf") and monitor.age("b", Role.WHEEL) == float("inf")
 
 
-def test_places_come_from_what_judges() -> None:
+def test_positions_come_from_the_judging_source() -> None:
     for judge, x in (("truth", 1.0), ("estimate", 2.0)):
         monitor = LinkMonitor(judge)  # type: ignore[arg-type]
         monitor.begin(BEGIN)
@@ -231,7 +232,7 @@ def test_an_emergency_stop_during_arming_holds(yard: Yard, monkeypatch: pytest.M
     assert pressed and states(yard)[0] == "stopped"
 
 
-def test_who_has_stopped_a_car_is_known(yard: Yard) -> None:
+def test_a_stop_of_another_station_is_noticed_and_needs_a_release(yard: Yard) -> None:
     yard.gates.begin()
     yard.gates.stop()
     yard.publish()
@@ -246,7 +247,7 @@ def test_who_has_stopped_a_car_is_known(yard: Yard) -> None:
     assert not yard.gates.stopped_by_others and states(yard) == ["armed", "armed"]
 
 
-def test_what_a_gate_has_said_before_is_not_believed_again(yard: Yard) -> None:
+def test_repeated_old_and_malformed_states_of_a_gate_are_dropped(yard: Yard) -> None:
     heard: list[Arrival] = []
     yard.hub.connect().subscribe(SVEA.topic_of("a", Role.GATE), heard.append)
     yard.gates.begin()
@@ -265,7 +266,7 @@ def test_what_a_gate_has_said_before_is_not_believed_again(yard: Yard) -> None:
     assert yard.gates.dropped["a"]["malformed"] == 1
 
 
-def test_a_gate_that_does_not_open_says_why(yard: Yard) -> None:
+def test_a_gate_that_does_not_open_is_reported_with_the_reason(yard: Yard) -> None:
     yard.links["b"]._gate._check = refuse  # type: ignore[method-assign]
     with pytest.raises(CoopenvError, match=r"b: its gate refuses this end's signature: .*--station"):
         yard.gates.begin()
@@ -274,7 +275,7 @@ def test_a_gate_that_does_not_open_says_why(yard: Yard) -> None:
 
 
 def refuse(*_message: object) -> None:
-    from coopenv.cars.gate import Reason, Rejected
+    from coopenv.cars.gate.gate import Reason, Rejected
 
     raise Rejected(Reason.SIGNATURE)
 
@@ -404,7 +405,7 @@ def test_a_car_without_its_conditions_is_not_armed(left_out: Role) -> None:
         assert SVEA.topic_of(CAR, left_out) in talk.obstacle()
 
 
-def test_what_has_been_said_counts_for_two_seconds() -> None:
+def test_conditions_of_a_car_count_for_two_seconds() -> None:
     talk = Talk()
     talk.all_is_well()
     talk.board.begin()
@@ -428,7 +429,7 @@ def test_what_has_been_said_counts_for_two_seconds() -> None:
         (lambda talk: talk.state(mode="HOLD"), "HOLD", False),
     ],
 )
-def test_a_car_in_another_state_is_not_armed_and_what_happens_to_an_armed_one_is_not_forgotten(
+def test_changed_conditions_prevent_arming_and_are_kept_while_armed(
     armed: Talk, change: Any, why: str, before: bool
 ) -> None:
     """`before`: whether it also counts before the car is armed, and not as a change alone."""
@@ -442,7 +443,7 @@ def test_a_car_in_another_state_is_not_armed_and_what_happens_to_an_armed_one_is
     assert armed.board.happened(CAR) == ""
 
 
-def test_old_words_neither_stop_a_car_nor_keep_it_going(armed: Talk) -> None:
+def test_old_conditions_neither_stop_a_car_nor_keep_it_going(armed: Talk) -> None:
     armed.remote(1300, *(1500,) * 7, age=2.5)
     armed.remote(1300, *(1500,) * 7, age=1.0)  # younger ones have come
     assert armed.board.happened(CAR) == ""

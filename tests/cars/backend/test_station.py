@@ -18,14 +18,14 @@ from coopenv.cars.backend.assembler import Assembler, Intake
 from coopenv.cars.backend.binding import Binding, bind
 from coopenv.cars.backend.buffers import KEPT, MOST_SAMPLES, Odometer, PlaceTrack
 from coopenv.cars.backend.station import MOST_WAITING, Pacer, Station
-from coopenv.cars.clock import Clock
-from coopenv.cars.codec import MOST_BYTES, encode, header, make
-from coopenv.cars.deployment import Car, Sensors
 from coopenv.cars.fake.lockstep import Hub
-from coopenv.cars.keys import Signer, Verifier
-from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.readings import Twist
-from coopenv.cars.transport import Arrival
+from coopenv.cars.link.clock import Clock
+from coopenv.cars.link.keys import Signer, Verifier
+from coopenv.cars.link.transport import Arrival
+from coopenv.cars.messages.codec import MOST_BYTES, encode, header, make
+from coopenv.cars.messages.readings import Twist
+from coopenv.cars.settings.deployment import Car, Sensors
+from coopenv.cars.settings.profile import SVEA, Role
 from coopenv.scenario import load_scenario
 
 PERIOD, TICKS = 0.01, 3
@@ -64,7 +64,7 @@ def decision(pacer: Pacer, clock: WorkClock, works: tuple[int, ...]) -> list[int
     return times
 
 
-def test_ticks_come_at_multiples_of_the_period_whatever_the_work_takes(clock):
+def test_ticks_come_at_multiples_of_the_period_for_any_work(clock):
     pacer, begin = begun(clock)
     times = [t for _ in range(50) for t in decision(pacer, clock, (4 * MS, 9 * MS, 6 * MS))]
     assert times == [begin + 10 * MS * k for k in range(1, 151)]
@@ -91,7 +91,7 @@ def test_a_late_decision_is_back_on_time_at_its_last_tick_without_having_missed_
     assert pacer.late(1.0) == pytest.approx(0.015)
 
 
-def test_what_takes_longer_than_a_decision_is_counted_once_and_never_made_up_for(clock):
+def test_work_longer_than_a_decision_counts_once_and_is_not_made_up_for(clock):
     pacer, begin = begun(clock)
     decision(pacer, clock, (0, 0, 75 * MS))  # until 105: the decisions that end at 60 and 90 are over
     times = decision(pacer, clock, (0, 0, 0))
@@ -122,7 +122,7 @@ def test_late_waking_is_measured_and_does_not_add_up(clock):
 
 
 @given(st.lists(st.integers(0, 200 * MS), min_size=1, max_size=30))
-def test_whatever_the_work_takes_commands_are_never_sent_in_a_burst(works):
+def test_commands_are_not_sent_in_a_burst_after_any_work(works):
     clock = WorkClock()
     (pacer, begin), sent = begun(clock), []
     for work in works:
@@ -208,7 +208,7 @@ def test_a_message_that_is_too_long_is_neither_kept_nor_looked_at() -> None:
     assert station.silence(topic) < 10.0
 
 
-def test_a_flood_of_one_topic_takes_nobody_elses_place() -> None:
+def test_a_flood_of_one_topic_drops_no_message_of_another() -> None:
     hub = Hub()
     flooded, other = SVEA.topic_of("svea7", Role.IMU), SVEA.topic_of("svea1", Role.WHEEL)
     station = Station(hub.connect(), (flooded, other), None, {})
@@ -222,7 +222,7 @@ def test_a_flood_of_one_topic_takes_nobody_elses_place() -> None:
     assert waiting[-1].payload == (50 * MOST_WAITING - 1).to_bytes(4)
 
 
-def test_what_others_have_not_signed_is_dropped_and_counted(tmp_path: Path) -> None:
+def test_messages_without_the_senders_signature_are_dropped_and_counted(tmp_path: Path) -> None:
     keys = {name: Ed25519PrivateKey.generate() for name in ("svea1", "svea7", "mallory")}
     verifier = Verifier({name: key.public_key() for name, key in keys.items() if name != "mallory"})
     topic, hub = SVEA.topic_of("svea1", Role.ESTIMATE), Hub()
@@ -306,7 +306,7 @@ def test_its_age_is_that_of_the_sensor_that_is_older() -> None:
     assert odometer.stamp == 3
 
 
-def test_samples_that_nobody_asks_for_fill_no_memory() -> None:
+def test_samples_that_are_not_taken_fill_no_memory() -> None:
     odometer = Odometer()
     for k in range(5 * MOST_SAMPLES):
         odometer.put(k, Twist(np.array([float(k), 0.0, 0.0]), np.zeros(3)))
@@ -329,7 +329,7 @@ def test_it_is_on_the_straight_line_and_goes_on_for_a_tenth_of_a_second() -> Non
     np.testing.assert_allclose(track.at(START - 1000 * NS_PER_MS), [0.0, 1.45, 0.0], atol=1e-12)
 
 
-def test_what_is_old_or_out_of_order_does_not_count() -> None:
+def test_old_positions_and_positions_out_of_order_do_not_count() -> None:
     track = PlaceTrack()
     track.put(START, np.array([1.0, 0.0, 0.0]))
     for older in (START - 1, START):

@@ -17,12 +17,12 @@ import coopenv
 from coopenv import CoopenvError, DataError
 from coopenv.base.errors import DataWarning
 from coopenv.bench.observers import sources
-from coopenv.cars import codec
-from coopenv.cars.backend.drive import DriveRecorder
+from coopenv.cars.backend.recorded_drive import DriveRecorder
+from coopenv.cars.backend.sources import BAG, DRIVE
 from coopenv.cars.bags.bag import Bag
 from coopenv.cars.bags.log import Shift, reconcile, recorders
 from coopenv.cars.bags.topics import regularity
-from coopenv.cars.source import BAG, DRIVE
+from coopenv.cars.messages import codec
 from coopenv.cli.app import main
 from coopenv.observers import Recording, run
 from coopenv.observers.sensed import Sensed
@@ -315,7 +315,7 @@ def test_two_cars_that_recorded_themselves_see_each_other(tmp_path: Path) -> Non
     assert not replayed.failure and (replayed.bytes_per_second > 0.0).any()
 
 
-def test_a_tape_of_cars_is_a_bag_too(folder: Path, tmp_path: Path, reference: list[Sensed]) -> None:
+def test_a_recorded_drive_is_a_bag_with_a_map(folder: Path, tmp_path: Path, reference: list[Sensed]) -> None:
     names = {"/agent8/pixy_node/objectsInfo": "fleet/svea3/pixy/objects_info",
              "/agent8/actuation_twist": "fleet/svea3/mavros/wheel_odometry/velocity",
              "/qualisys/svea3/pose": "fleet/qualisys/svea3/pose",
@@ -360,7 +360,7 @@ def test_files_with_nothing_in_common_keep_their_stamps() -> None:
     assert found.shifts["b"] == Shift(None, 0)
 
 
-def test_what_somebody_says_counts() -> None:
+def test_stated_offsets_replace_estimated_offsets() -> None:
     found = reconcile([{"a": 900 * MS, "b": 3 * MS}], 20 * MS, {"a": 5 * MS})
     assert found.shifts["a"].added == 5 * MS and found.shifts["b"].added == 0
     assert reconcile([{"a": 900 * MS}], float("inf"), {}).shifts["a"].added == 0

@@ -69,7 +69,7 @@ def test_offset_and_drift_of_a_clock(offset: float, drift: float) -> None:
     seed=st.integers(0, 1000),
 )
 @settings(max_examples=40)
-def test_a_jump_of_the_clock_is_found_and_a_longer_way_is_none(
+def test_a_jump_of_the_clock_is_found_and_a_longer_transport_is_no_jump(
     jump: float | None, late: bool, rate: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -239,7 +239,7 @@ def test_a_clock_that_jumps_costs_nothing(
     assert error_of(unchanged) > 10.0 * reference and "removed" not in silent
 
 
-def test_what_is_printed_can_be_stated(clean: list[bags.Message], tmp_path: Path) -> None:
+def test_the_printed_offsets_give_the_same_result_in_the_map(clean: list[bags.Message], tmp_path: Path) -> None:
     apart = bags.later(clean, stamps=-0.3, topics=TWIST)
     bag, notes = opened(tmp_path, apart)
     key = re.search(r"clocks\.(offsets = \{.*\})", notes)

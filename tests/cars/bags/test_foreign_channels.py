@@ -271,7 +271,7 @@ def test_a_definition_that_makes_messages_grow_is_refused(name: str, encoding: s
 
 
 def test_a_known_type_with_a_hostile_definition_is_read_by_ours() -> None:
-    from coopenv.cars import codec
+    from coopenv.cars.messages import codec
 
     message = codec.make("geometry_msgs/msg/PointStamped", header=codec.header(5), point=(1.0, 2.0, 3.0))
     text = "std_msgs/Empty[] z\n" + SEPARATOR + "MSG: std_msgs/Empty\n"
@@ -280,7 +280,7 @@ def test_a_known_type_with_a_hostile_definition_is_read_by_ours() -> None:
 
 
 def test_poses_in_transforms_are_named_where_there_is_no_motion_capture(plain: Path, tmp_path: Path) -> None:
-    from coopenv.cars import codec
+    from coopenv.cars.messages import codec
 
     kind = "tf2_msgs/msg/TFMessage"
     parts = [("mocap", "svea3"), ("svea3", "camera"), ("mocap", "table")]

@@ -7,10 +7,12 @@ from itertools import count
 import pytest
 from pydantic import ValidationError
 
-from coopenv.cars.deployment import Safety
-from coopenv.cars.gate import PERIOD, Gate, GateClock, read_drive
-from coopenv.cars.profile import NEUTRAL, SVEA, Brake, CarProfile, Limits, MotionCommand, Role
-from tests.cars.link.gate import messages
+from coopenv.cars.gate.gate import PERIOD, Gate, GateClock
+from coopenv.cars.gate.wheel_command import NEUTRAL, Brake, MotionCommand, read_drive
+from coopenv.cars.settings.deployment import Safety
+from coopenv.cars.settings.limits import Limits
+from coopenv.cars.settings.profile import SVEA, CarProfile, Role
+from tests.cars.gate import messages
 from tests.helpers.env_suite import rest_slow
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 

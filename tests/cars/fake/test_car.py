@@ -9,9 +9,9 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.cars.codec import stamp_of
-from coopenv.cars.deployment import Sensors
-from coopenv.cars.profile import Role
+from coopenv.cars.messages.codec import stamp_of
+from coopenv.cars.settings.deployment import Sensors
+from coopenv.cars.settings.profile import Role
 from coopenv.scenario import load_scenario
 from coopenv.sources.base import Command
 from coopenv.sources.worlds import Simulated
@@ -134,7 +134,7 @@ def test_sensors_are_asynchronous() -> None:
     }
 
 
-def test_a_moving_landmark_drives_its_motion_and_says_where_it_is() -> None:
+def test_a_moving_landmark_follows_its_motion_and_publishes_its_pose() -> None:
     stage = Stage("svea_crossing", CROSSING, EXACT)
     stage.reset(0)
     stage.run(6.0)
@@ -216,7 +216,7 @@ def test_pixels_of_many_poses() -> None:
     assert seen > 60 and unseen > 20
 
 
-def test_cars_see_each_other_and_hide_what_is_behind() -> None:
+def test_cars_see_each_other_and_occlude_markers() -> None:
     """The other car is where motion capture has it: a message of another fake."""
     stage, rng = Stage("svea_overtaking", OVERTAKING, EXACT), np.random.default_rng(2)
     hidden, cars = 0, 0

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.base.fault_text import FaultError
-from coopenv.cars.codec import stamp_of
 from coopenv.cars.fake import car
 from coopenv.cars.fake.settings import FAKE_FAULTS, CarFaults, fake_fault, fault_topic
-from coopenv.cars.profile import SVEA, Role
+from coopenv.cars.messages.codec import stamp_of
+from coopenv.cars.settings.profile import SVEA, Role
 from tests.helpers.fakes import CROSSING, EXACT, OVERTAKING, Stage
 
 
@@ -21,7 +21,7 @@ from tests.helpers.fakes import CROSSING, EXACT, OVERTAKING, Stage
     start=st.floats(0, 1e5),
     duration=st.floats(0, 1e5) | st.none(),
 )
-def test_what_is_written_is_read(kind: str, value: float, start: float, duration: float | None) -> None:
+def test_a_written_fault_is_read(kind: str, value: float, start: float, duration: float | None) -> None:
     text = f"{kind}={value!r}@{start!r}" + ("" if duration is None else f"+{duration!r}")
     found = fake_fault(text)
     begun = (found.name, found.value, found.start_in(0.0), found.duration)
@@ -42,7 +42,7 @@ def test_what_is_written_is_read(kind: str, value: float, start: float, duration
         ("=3", r"fault '=3': expected \[VEHICLE:\]NAME\[=VALUE\]\[@START"),
     ],
 )
-def test_what_is_no_fault_is_one_line(text: str, said: str) -> None:
+def test_an_invalid_fault_is_one_line(text: str, said: str) -> None:
     with pytest.raises(FaultError, match=said) as caught:
         fake_fault(text)
     assert "\n" not in str(caught.value)
@@ -63,7 +63,7 @@ def stage() -> Stage:
     return made
 
 
-def test_a_frozen_car_says_nothing_and_stops_where_nobody_commands_it(stage: Stage) -> None:
+def test_a_frozen_car_sends_nothing_and_comes_to_a_stand(stage: Stage) -> None:
     stage.drive("svea7", 0.3, 0.0, 2.0)
     stage.ask("freeze@0+2")
     stage.forget()

@@ -14,14 +14,14 @@ import pytest
 
 import coopenv
 from coopenv.cars.backend.backend import Svea
-from coopenv.cars.clock import SimulatedClock
-from coopenv.cars.deployment import Safety, load_deployment
 from coopenv.cars.fake.fleet import FakesError, prepare_fake
 from coopenv.cars.fake.lockstep import Hub, LockstepFakes
-from coopenv.cars.gate import read_drive
-from coopenv.cars.gate_process import GateConnection, prepare_gate
-from coopenv.cars.profile import SVEA, Role, presence_of
-from coopenv.cars.transport import Arrival
+from coopenv.cars.gate.process import GateConnection, prepare_gate
+from coopenv.cars.gate.wheel_command import read_drive
+from coopenv.cars.link.clock import SimulatedClock
+from coopenv.cars.link.transport import Arrival
+from coopenv.cars.settings.deployment import Safety, load_deployment
+from coopenv.cars.settings.profile import SVEA, Role, presence_of
 from tests.helpers.cars import OVERTAKING, SAFETY, cars, write_fleet
 from tests.helpers.commands import refused
 

@@ -310,7 +310,7 @@ def test_intervals_cover_a_tick_and_take_every_sample(camera: float, odometry: f
         {"vehicles.0.motion": {"kind": "static"}},
     ],
 )
-def test_what_has_no_derivative_is_refused(change: dict[str, Any]) -> None:
+def test_scenarios_without_a_derivative_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(coopenv.ScenarioError, match="differentiable rollout needs"):
         check_differentiable(scenario(**change))
 

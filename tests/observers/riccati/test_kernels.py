@@ -230,7 +230,7 @@ def embedded(scenario: Scenario, seed: int) -> tuple[np.ndarray, np.ndarray, np.
     return tuple(np.array(column) for column in zip(*rows, strict=True))  # type: ignore[return-value]
 
 
-def test_it_is_the_embedded_observer_with_camera_and_markers_off_centre() -> None:
+def test_the_plug_in_is_the_embedded_observer_with_camera_and_markers_off_centre() -> None:
     """Other cases are in tests/api/test_plugins.py."""
     scenario = small_errors({"horizon": 2.0, "noise.bearing.scale": 0.003}, size=0.5)
     R, p, P, nees = embedded(scenario, 5)
@@ -330,7 +330,7 @@ RUNS: dict[str, tuple[Scenario, int, int]] = {
 
 
 @pytest.mark.parametrize(("name", "dtype"), [*((name, "float32") for name in RUNS), ("stiff", "float64")])
-def test_it_stays_healthy(name: str, dtype: str) -> None:
+def test_estimates_stay_healthy(name: str, dtype: str) -> None:
     made, ticks, every = RUNS[name]
     watch(start(made, range(4), dtype), ticks, every)
 

@@ -165,7 +165,7 @@ def test_the_variance_of_what_is_not_linear_counts_as_noise(seed: int) -> None:
     assert (ratio > 0.6).all() and (ratio < 1.5).all(), ratio
 
 
-def test_it_grows_with_the_fourth_power_of_the_uncertainty() -> None:
+def test_linearisation_variance_grows_with_the_fourth_power_of_the_uncertainty() -> None:
     P = np.diag([1e-8] * 3 + [0.03**2] * 3)
     assert_allclose(noise_of(4.0 * P, 1e-3) / noise_of(P, 1e-3), 16.0, rtol=0.05)
 
@@ -176,7 +176,7 @@ def test_frames_in_which_it_is_the_same_count_as_one() -> None:
     assert_allclose(noise_of(P, 1e-3) / noise_of(P, 1e-2), 10.0, rtol=0.05)
 
 
-def test_that_of_a_sender_counts_by_the_errors_of_both() -> None:
+def test_linearisation_variance_of_a_sender_counts_the_errors_of_both() -> None:
     """Both uncertain by the same: variances of relative positions double, and the product grows fourfold."""
     P = np.diag([1e-10] * 3 + [0.05**2] * 3)
     tight = np.diag([1e-10] * 3 + [1e-6] * 3)

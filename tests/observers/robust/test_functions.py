@@ -190,7 +190,7 @@ def test_the_covariance_follows_its_differential_equation(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_what_lasts_is_in_the_covariance_as_in_drawn_trips(seed: int) -> None:
+def test_systematic_errors_are_in_the_covariance_as_in_drawn_trips(seed: int) -> None:
     """A gyro's bias and a scale error, drawn: the errors of the pose at the end have the covariance that is stated."""
     bias, scale = (0.01, 0.02, 0.015), 0.05
     noise = SensorNoise(1e-3, 1e-4, PERIOD, 0.003, odometry_scale=scale, gyro_bias=bias)

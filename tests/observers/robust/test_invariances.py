@@ -10,12 +10,13 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from benchmarks.robust.worlds import watched
 from coopenv.bench.observers.convergence import random_start
 from coopenv.observers import Recording, run
 from coopenv.observers.runner import Run
 from coopenv.observers.sensed import Truth
 from coopenv.scenario import load_scenario
-from tests.helpers.robust_worlds import noise_free, small_errors, watched
+from tests.helpers.robust_worlds import noise_free, small_errors
 
 TURN, SHIFT = Rotation.from_rotvec([0.4, -0.7, 2.0]).as_matrix(), np.array([30.0, -80.0, 7.0])
 MIRROR = np.diag([1.0, -1.0, 1.0])

@@ -39,7 +39,7 @@ def misled(record):
 
 
 def test_landmarks_that_are_lost_do_not_mislead():
-    """Other faults are those of tests/observers/robust/test_depth.py and test_lies.py."""
+    """Other faults are those of tests/observers/robust/test_consistency.py and test_false_messages.py."""
     lost = [VARIANTS["landmarks_lost"].applied(small_errors(12.0, seed), seed) for seed in range(2)]
     results = [completed("robust", record) for record in lost]
     off, limit = np.array([result.position_error[-1] for result in results]), np.array([0.1, 0.1, 0.15, 0.3, 0.8])
@@ -56,7 +56,7 @@ def test_wrong_associations_mislead_in_the_first_frames_only():
     assert not misled(replace(right, bearings=np.where(first, right.bearings, wrong[0].bearings)))
 
 
-def test_a_vehicle_that_is_lost_says_nothing_and_finds_itself_again():
+def test_a_lost_vehicle_sends_nothing_and_finds_its_place_again():
     record = small_errors(12.0)
     said = []
 
@@ -87,7 +87,7 @@ def test_robots_on_a_plane_are_pointed_to_their_observer():
         find("robust")(replace(setup, planar=True))
 
 
-def test_rumours_that_go_round_do_not_make_anybody_overconfident():
+def test_messages_in_cycles_make_no_vehicle_overconfident():
     record = everybody_sees_everybody(8.0)
     result = completed("robust", record)
     assert (result.anees(3.0) < 2.0).all()

@@ -68,7 +68,6 @@ def cost(watched: Watched, without: Watched, start: float) -> np.ndarray:
         ],
         0,
         3,
-        5,
     ),
 )
 def test_a_sensitivity_is_the_derivative_of_the_estimate(
@@ -111,7 +110,7 @@ def test_a_sensitivity_to_the_focal_length_is_the_derivative_of_the_estimate() -
         assert_allclose(found, expected, rtol=0.05, atol=0.02 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("start", [0, 6])
+@pytest.mark.parametrize("start", rest_slow([0, 6], 1))
 def test_a_wrong_focal_length_of_one_camera_is_found_and_costs_little(start: int) -> None:
     """By 5 %: it becomes a state, and no other source is excluded."""
     recording = forwards(fast(16.0, 0))
@@ -185,7 +184,7 @@ def test_errors_of_senders_are_eliminated(seed: int) -> None:
     assert not observer.memory.information.any()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", rest_slow(range(3), 0))
 def test_the_solution_without_a_landmark_follows_from_that_with_it(seed: int) -> None:
     """x + Phi f against a run in which the landmark is not seen, in deviations; x alone is elsewhere."""
     with_it, k, off = usual(seen, 3.2, seed), 60, []
@@ -202,7 +201,7 @@ def test_the_solution_without_a_landmark_follows_from_that_with_it(seed: int) ->
     assert rms[1] < 0.5 * rms[0], rms
 
 
-@pytest.mark.parametrize("landmark", ["SL1", "SL2", "SL3"])
+@pytest.mark.parametrize("landmark", rest_slow(["SL1", "SL2", "SL3"], 1))
 def test_a_landmark_that_is_wrong_from_the_start_is_rejected_whichever_comes_first(landmark: str) -> None:
     """By its start the leader can tell which of three bearings is wrong, though each alone fits."""
     map_error = {"chance": 1.0, "landmark": landmark, "offset": 3.0}
@@ -213,7 +212,7 @@ def test_a_landmark_that_is_wrong_from_the_start_is_rejected_whichever_comes_fir
     assert np.median(engine.view("position_error")[:, 0]) < 1.0  # 2.4 to 4.5 m with each bearing gated alone
 
 
-@pytest.mark.parametrize(("landmark", "size"), rest_slow([(4, 0.1), (5, 0.1), (6, 0.3), (8, 0.3)], 0, 2))
+@pytest.mark.parametrize(("landmark", "size"), rest_slow([(4, 0.1), (5, 0.1), (6, 0.3), (8, 0.3)], 2))
 def test_a_landmark_s_fault_is_estimated(landmark: int, size: float) -> None:
     """At the exclusion, or when it is last seen, with the covariance that is stated: a chi-square of 3 or so."""
     rng, squares, right = np.random.default_rng(landmark), [], []
@@ -237,9 +236,9 @@ def test_a_landmark_s_fault_is_estimated(landmark: int, size: float) -> None:
 
 @pytest.mark.parametrize(
     ("make", "of", "most"),
-    rest_slow([(busy, (24.0, 0), 3.0), (busy, (24.0, 1), 3.0), (fast, (16.0, 0), 3.0), (lane, (), 4.0)], 0, 2, 3),
+    rest_slow([(busy, (24.0, 0), 3.0), (busy, (24.0, 1), 3.0), (fast, (16.0, 0), 3.0), (lane, (), 4.0)], 0, 3),
 )
-def test_who_is_honest_is_believed(make: Callable[..., Recording], of: tuple[float, ...], most: float) -> None:
+def test_honest_sources_stay_below_the_gate(make: Callable[..., Recording], of: tuple[float, ...], most: float) -> None:
     """Ratios are of a size of a chi-square, or below: nobody comes near the gate.
 
     Its median is 2.4 for 3 unknowns, and 0.45 for that of the velocity's fault, which is along it.
@@ -266,7 +265,6 @@ def test_who_is_honest_is_believed(make: Callable[..., Recording], of: tuple[flo
             *((parametric, (road,), fault) for fault in ("gyro_step=3@12", "camera_step=1@12")),
         ],
         0,
-        3,
     ),
 )
 def test_a_step_in_an_own_sensor_of_all_vehicles_costs_little(
@@ -291,7 +289,7 @@ def test_a_scale_that_keeps_changing_becomes_a_scale_that_walks() -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "vehicle", "angle"), rest_slow([(busy, 1, 3.0), (busy, 3, -5.0), (fast, 0, 2.0), (fast, 2, -8.0)], 0, 3)
+    ("make", "vehicle", "angle"), rest_slow([(busy, 1, 3.0), (busy, 3, -5.0), (fast, 0, 2.0), (fast, 2, -8.0)], 3)
 )
 def test_a_turn_of_a_camera_costs_nothing(make: Callable[..., Recording], vehicle: int, angle: float) -> None:
     """Own sensors alone are corrected, within 2.5 s, and all others stay as they were."""
@@ -306,7 +304,7 @@ def test_a_turn_of_a_camera_costs_nothing(make: Callable[..., Recording], vehicl
     assert found.run.anees(least)[vehicle] < 3.0
 
 
-@pytest.mark.parametrize("end", [16.0, np.inf])
+@pytest.mark.parametrize("end", rest_slow([16.0, np.inf], 0))
 @pytest.mark.parametrize("seed", rest_slow([3, 4, 5], 1))
 def test_a_landmark_that_jumps_costs_no_more_than_without_it(seed: int, end: float) -> None:
     recording = busy(24.0, seed)
@@ -359,22 +357,7 @@ def test_a_sender_that_is_right_again_is_readmitted(seed: int) -> None:
         assert len(found.changes(vehicle, liar)) == 1
 
 
-def test_a_gyro_s_bias_that_is_not_declared_costs_little() -> None:
-    """Of 1 deg/s from 12 s on."""
-    step, without = CHANGES["gyro bias steps to 1 deg/s at 12 s"], usual(busy, 24.0, 0)
-    ratios = cost(watch(changed(without.recording, step, 0)), without, STEP_AT)
-    assert np.mean(ratios) < 1.5, np.round(ratios, 2)
-
-
-def test_a_wrong_landmark_on_a_fast_road_costs_little() -> None:
-    """Off by 3 m, and passed at 25 m/s."""
-    found = [watch(wrong_landmark(fast(16.0, seed), 7, 3.0 * METRE)) for seed in range(2)]
-    assert all(one.excluded() == {(0, 7), (1, 7), (2, 7)} for one in found)
-    ratios = [cost(one, usual(fast, 16.0, seed), 4.0) for seed, one in enumerate(found)]
-    assert np.mean(ratios) < 1.5, np.round(ratios, 2)
-
-
-@pytest.mark.parametrize("make", [busy, fast])
+@pytest.mark.parametrize("make", rest_slow([busy, fast], 1))
 def test_random_bearings_cost_little(make: Callable[..., Recording]) -> None:
     """Of ten bearings one points anywhere; no source has them all."""
     ratios, (horizon, seeds) = [], (24.0, 1) if make is busy else (16.0, 2)  # as above

@@ -1,0 +1,1 @@
+"""Constants of cars from their drives."""

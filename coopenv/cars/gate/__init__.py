@@ -1,0 +1,1 @@
+"""The gate on a car, the only process that commands its wheels."""

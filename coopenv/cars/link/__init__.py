@@ -1,0 +1,1 @@
+"""Networks of cars: transports, clocks and keys."""

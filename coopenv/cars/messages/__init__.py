@@ -1,0 +1,1 @@
+"""Messages of cars: bytes, checked values, and bearings in frames."""

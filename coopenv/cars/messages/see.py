@@ -1,0 +1,82 @@
+"""`coopenv svea see`: a node that finds the tags in a car's frames and publishes their bearings."""
+
+import sys
+from collections import Counter
+from collections.abc import Iterable
+from contextlib import suppress
+from queue import Empty, Queue
+from typing import Any
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.link.transport import Arrival, Transport
+from coopenv.cars.messages.codec import decode, encode, header, make, stamp_of
+from coopenv.cars.messages.readings import Detections, read
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.profile import CarProfile, Role
+
+SILENT = 2.0  # s without a frame that are worth a line
+
+
+def object_bearings(markers: Iterable[int], rays: Iterable[Iterable[float]]) -> list[Any]:
+    """Return ObjectBearings of markers by rays (3,), camera to marker, optical frame; the message has the opposite."""
+    rows = ((marker, *ray) for marker, ray in zip(markers, rays, strict=True))
+    kind = "pixy_camera/msg/ObjectBearing"
+    return [make(kind, id=n, bearing_x=-x, bearing_y=-y, bearing_z=-z) for n, x, y, z in rows]
+
+
+MOST_REASONS = 100  # that are counted; errors quote what a message holds
+
+
+class FrameReader:
+    """Publishes the bearings of tags in frames, the newest first; frames that come in the meantime are left out."""
+
+    def __init__(self, car: str, profile: CarProfile, calibration: Calibration, transport: Transport) -> None:
+        """Subscribe to the frames of a car.
+
+        Args:
+            car: its name.
+            profile: of its make, whose detections are frames.
+            calibration: of its camera.
+            transport: the network; stays the caller's.
+        """
+        self._car, self._profile, self._calibration, self._transport = car, profile, calibration, transport
+        self._topics = {role: profile.topic_of(car, role) for role in (Role.DETECTIONS, Role.BEARINGS)}
+        self._newest = Queue[Arrival](1)
+        self.counts = Counter[str]()
+        """Frames that were `read` or `left out`, and the others by the reason for which they are not used."""
+        transport.subscribe(self._topics[Role.DETECTIONS], self._keep)
+
+    def _keep(self, arrival: Arrival) -> None:
+        with suppress(Empty):
+            self._newest.get_nowait()
+            self.counts["left out"] += 1
+        self._newest.put_nowait(arrival)  # the only thread that puts
+
+    def run(self) -> None:
+        """Read frames until an exception, such as that of a signal; each trouble is one line of standard error."""
+        while True:
+            try:
+                self.publish(self._newest.get(timeout=SILENT))
+                self.counts["silent"] = 0
+            except Empty:
+                self._note("silent", f"no frame for {SILENT:g} s on {self._topics[Role.DETECTIONS]}")
+            except CoopenvError as error:
+                self._note(str(error), str(error))
+
+    def _note(self, reason: str, line: str) -> None:
+        if reason not in self.counts and len(self.counts) >= MOST_REASONS:
+            return
+        self.counts[reason] += 1
+        if self.counts[reason] == 1:
+            print(f"{self._car}: {line}", file=sys.stderr, flush=True)
+
+    def publish(self, arrival: Arrival) -> None:
+        """Publish the bearings of a frame, stamped with the middle of its exposure. Raises CoopenvError: it is none."""
+        message = decode(arrival.payload, self._profile.topics[Role.DETECTIONS].type)
+        found = read(Role.DETECTIONS, message, self._calibration, vision=self._profile.vision)
+        assert isinstance(found, Detections)
+        topic, entries = self._profile.topics[Role.BEARINGS], object_bearings(found.markers, found.bearings.tolist())
+        about = header(stamp_of(message) + found.late, message.header.frame_id)
+        payload = encode(make(topic.type, header=about, bearing=entries))
+        self._transport.publish(self._topics[Role.BEARINGS], payload, urgent=topic.urgent, reliable=topic.reliable)
+        self.counts["read"] += 1

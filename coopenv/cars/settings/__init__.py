@@ -1,0 +1,1 @@
+"""Settings of cars: the make's profile, the deployment of a fleet, sensors."""
