@@ -8,15 +8,16 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from time import monotonic, process_time, thread_time
 from typing import NamedTuple
 
 from benchmarks.options import status_of
 from coopenv.base.errors import CoopenvError
+from coopenv.observers.registry import with_observer
 from coopenv.runs.live import EngineReel
-from coopenv.runs.scenes import driver_of, open_source
+from coopenv.runs.scenes import driver_of
 from coopenv.runs.view import Viewer
+from coopenv.sources.sources import open_backend
 from coopenv.viz.web import guarded_server
 
 WARM_UP = 2.0  # s
@@ -72,7 +73,7 @@ class TimedReel(EngineReel):
 
 def measured(name: str, observer: str | None, seconds: float, watched: bool) -> Measured:
     """Show an environment for some seconds."""
-    opened = partial(open_source, name, observer=observer)
+    opened = lambda more: open_backend(name, None, with_observer(more, observer))  # noqa: E731
     reel = TimedReel(opened, name, 0, lambda scenario: driver_of(None, scenario, name, 0))
     try:
         with guarded_server("127.0.0.1") as (server, url):

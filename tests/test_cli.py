@@ -280,7 +280,7 @@ def test_vehicles_without_true_poses_do_not_hide_the_errors_of_others() -> None:
     assert other["vehicle"] == "vehicle_2" and np.isnan(other["position_std_m"])  # P of this observer is a gain
 
 
-@pytest.mark.parametrize("name", ["record.zip", "replay.html", "errors.png", "video.gif"])
+@pytest.mark.parametrize("name", ["trajectory.npz", "replay.html", "errors.png", "video.gif"])
 def test_results_that_cannot_be_written_are_found_before_the_run(
     name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

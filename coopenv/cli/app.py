@@ -77,9 +77,7 @@ def describe(given: DescribeOptions) -> None:
     from coopenv.sources.sources import simulation_of
 
     name = Path(given.environment).stem
-    if kind_of(given.environment) is not ENVIRONMENT or any(
-        (given.data, given.variant, given.topics, given.selection.given)
-    ):
+    if kind_of(given.environment) is not ENVIRONMENT or given.selection.given or any(given.files.values()):
         backend = given.open()
         scenario, recorded = backend.scenario, backend.capabilities.recorded
     else:

@@ -151,6 +151,11 @@ class SourceOptions:
         return Selection.of(self.start, self.until, self.robots)
 
     @property
+    def files(self) -> dict[str, Any]:
+        """Options of recorded data, as for `open_backend`."""
+        return {"data": self.data, "variant": self.variant, "topics": self.topics}
+
+    @property
     def changes(self) -> dict[str, Any]:
         """The overrides of the scenario, dotted key to value."""
         return parse_overrides(self.overrides)
@@ -159,8 +164,7 @@ class SourceOptions:
         """Return the source of ticks."""
         from coopenv.sources.sources import open_backend
 
-        known: dict[str, Any] = {"topics": self.topics, "selection": self.selection}
-        return open_backend(self.environment, None, self.changes, self.data, self.variant, **known)
+        return open_backend(self.environment, None, self.changes, self.selection, **self.files)
 
 
 def console(stderr: bool = False) -> Console:

@@ -116,13 +116,13 @@ def record(given: RecordOptions) -> None:
     The file holds every tick; coopenv replays it, Foxglove and Lichtblick show it with the estimates of an observer.
     """
     from coopenv.base.files import check_new
+    from coopenv.observers.registry import with_observer
     from coopenv.runs.console import Progress
     from coopenv.runs.recorder import record_episode
     from coopenv.runs.scenes import (
         MOST_SHOWN,
         frame_stride,
         observer_of,
-        open_source,
         pages_can_be_written,
         played_scene,
         title_of,
@@ -130,7 +130,7 @@ def record(given: RecordOptions) -> None:
         write_page,
     )
     from coopenv.sources.registry import kind_of
-    from coopenv.sources.sources import open_recording
+    from coopenv.sources.sources import open_backend, open_recording
 
     out, page, observer, environment = given.out, given.out.with_suffix(".html"), given.observer, given.environment
     check_log(out, observer, given.scene)
@@ -159,7 +159,7 @@ def record(given: RecordOptions) -> None:
     if played is None:
         with warnings.catch_warnings(action="ignore", category=DataWarning):  # these have been printed
             shown = observer or observer_of(recording)
-            backend = open_source(environment, {}, shown, given.data, given.variant, selection=given.selection)
+            backend = open_backend(environment, None, with_observer({}, shown), given.selection, **given.files)
             whole = backend.scenario.horizon
             first = f", first {MOST_SHOWN:g} s of {whole:.0f} s" if whole > MOST_SHOWN else ""
             played = played_scene(backend, title_of(environment) + first, log, longest=MOST_SHOWN)

@@ -57,14 +57,15 @@ class SceneOptions(options.SourceOptions):
         Raises:
             CoopenvError: there is no such source, or an option is not for it.
         """
-        from coopenv.runs.scenes import open_source
+        from coopenv.observers.registry import with_observer
         from coopenv.sources.registry import kind_of
+        from coopenv.sources.sources import open_backend
 
         if self.agent is not None and kind_of(self.environment, self.topics).recorded:
             raise CoopenvError(f"--agent: is for a simulation, {self.environment} is recorded")
-        changes = {**self.changes, **(more or {})}
         observer = (more or {}).get("observer.name", self.observer)
-        return open_source(self.environment, changes, observer, self.data, self.variant, self.topics, self.selection)
+        changes = with_observer({**self.changes, **(more or {})}, observer)
+        return open_backend(self.environment, None, changes, self.selection, **self.files)
 
     def driver(self, scenario: "Scenario") -> "tuple[Policy | None, str]":
         """Return the driver of a scenario, and its name. Raises CoopenvError: it cannot drive here."""
@@ -238,9 +239,7 @@ class ViewOptions(SceneOptions):
 
         watching = {} if self.observer is None else {"observer.name": self.observer}
         changes = {**self.changes, **watching, **(more or {})}
-        return open_backend(
-            self.deployment, self.environment, changes, options={"connect": self.connect, "watch": True}
-        )
+        return open_backend(self.deployment, self.environment, changes, connect=self.connect, watch=True)
 
     def reel(self) -> "Reel":
         """Return the source of frames; cars are observed and not driven.

@@ -81,7 +81,7 @@ class LogView:
         """(K, N, 6, 6) of position and rotation in the map."""
         self.semi, self.axes = semi_axes(self.covariance[..., :3, :3])
         """(K, N, 3) and (K, N, 3, 3) of ellipsoids of 3 sigma."""
-        self.pan = np.zeros(self.position.shape[:2]) if r.pan is None else r.pan
+        self.pan = r.filled("pan")
         self.moving_landmarks = np.flatnonzero((r.landmarks != r.landmarks[:1]).any(axis=(0, 2))).tolist()
         points = np.concatenate([r.landmarks[0], r.truth.position[0], r.start_position])
         points = points[np.isfinite(points).all(axis=1)]

@@ -1,7 +1,7 @@
 """The table of the arrays of ticks, recordings and logs: axes, rule and kind of each, and checks by it."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from coopenv.estimation.validity import (
     everywhere,
 )
 from coopenv.observers.contract import Setup
+
+if TYPE_CHECKING:
+    from coopenv.scenario import Scenario
 
 LARGEST_PAN = 3.15  # rad, after rounding
 LEAST_EIGENVALUE = 1e-12  # least eigenvalue of the correlations of an initial estimate
@@ -56,6 +59,13 @@ class ArraySpec(NamedTuple):
     rule: Rule
     kind: str = "f"  # NumPy's
     recorded: bool = True  # False: only ticks have it
+    optional: float | None = None  # the value of all entries of an absent array; None: the array is always there
+    present: Callable[["Scenario | None"], bool] = lambda scenario: True  # whether a scenario's recordings have it
+
+    @property
+    def dtype(self) -> Any:
+        """The NumPy type of its entries."""
+        return {"f": np.float64, "i": np.int64, "b": np.bool_}[self.kind]
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int, ...]:
         """Return the shape by the lengths of the axes; an axis without one is left out."""
@@ -72,19 +82,26 @@ ARRAYS = {
     "landmarks": ArraySpec("KL3", VECTOR),
     "inbox_tick": ArraySpec("KNN", SENT, "i"),
     "due": ArraySpec("K", FLAG, "b"),
-    "pan": ArraySpec("KN", ANGLE),
+    "pan": ArraySpec(
+        "KN", ANGLE, optional=0.0, present=lambda scenario: scenario is not None and scenario.action.pan is not None
+    ),
     "truth.rotation": ArraySpec("KN33", ROTATION._replace(of_truth=True)),
     "truth.position": ArraySpec("KN3", VECTOR._replace(of_truth=True)),
-    "odometry_age": ArraySpec("KN", AGE, recorded=False),
-    "bearing_age": ArraySpec("KN", AGE, recorded=False),
-    "missing": ArraySpec("KN", FLAG, "b", recorded=False),
-    "late": ArraySpec("KN", FLAG, "b", recorded=False),
+    "odometry_age": ArraySpec("KN", AGE, recorded=False, optional=0.0),
+    "bearing_age": ArraySpec("KN", AGE, recorded=False, optional=0.0),
+    "missing": ArraySpec("KN", FLAG, "b", recorded=False, optional=False),
+    "late": ArraySpec("KN", FLAG, "b", recorded=False, optional=False),
     "start_rotation": ArraySpec("N33", ROTATION),
     "start_position": ArraySpec("N3", VECTOR),
     "start_covariance": ArraySpec("N66", COVARIANCE),
 }
 """Arrays by name; arrays of the truth are fields of `Truth`."""
 KINDS_OF_TICKS = {"f": "fiu", "i": "iu", "b": "b"}
+
+
+def recorded_names(scenario: "Scenario | None") -> list[str]:
+    """Return the names of the arrays that a recording in a scenario has; None: of recorded robots."""
+    return [name for name, spec in ARRAYS.items() if spec.recorded and spec.present(scenario)]
 
 
 def sizes_of(setups: Sequence[Setup]) -> dict[str, int]:

@@ -16,10 +16,10 @@ from coopenv.base.errors import DataError, DataWarning, shown
 from coopenv.base.sections import LARGEST
 from coopenv.estimation.poses import MISFIT_DEG, Array, bearing_misfit_deg, exp_so3, exp_translation
 from coopenv.estimation.validity import Mask, are_numbers, are_unit_vectors, everywhere
-from coopenv.observers.arrays import ARRAYS, invalid_rows, misshapen, sizes_of
+from coopenv.observers.arrays import ARRAYS, invalid_rows, misshapen, recorded_names, sizes_of
 from coopenv.observers.contract import Gains, ObserverInit, Received, SensorNoise, Setup, Tick
 from coopenv.observers.faults import Interference
-from coopenv.observers.sensed import MEASURED, Measurements, Sensed, Truth, is_due
+from coopenv.observers.sensed import Measurements, Sensed, Truth, is_due
 from coopenv.scenario import Scenario
 from coopenv.scenario.difficulty import MOST, PARAMETERS
 from coopenv.scenario.schema import neighbour_sets, processing_order
@@ -52,7 +52,6 @@ class Recording(Measurements):
     start_position: Array  # (N, 3) map, m
     start_covariance: Array  # (N, 6, 6) LEFT coordinates
     truth: Truth  # of the K ticks
-    pan: Array | None = None  # (K, N) rad, by which cameras were turned to the left; None: never
     scenario: Scenario | None = None  # the world that was recorded; None for recorded robots
     drawn: Drawn | None = None  # None: not simulated
     interference: Interference | None = None  # of the world's faults with messages and observers; None: there is none
@@ -186,10 +185,13 @@ class Recording(Measurements):
 
     def at(self, k: int) -> Sensed:
         """Return the measurements of all vehicles at tick k."""
-        sensed = {name: getattr(self, name)[k] for name in PER_TICK}
+        sensed: dict[str, Any] = {name: values[k] for name, values in self.per_tick().items()}
         truth = Truth(self.truth.rotation[k], self.truth.position[k])
-        pan = None if self.pan is None else self.pan[k]
-        return Sensed(index=k, dt=self.dt, due=bool(self.due[k]), pan=pan, truth=truth, **sensed)
+        return Sensed(index=k, dt=self.dt, due=bool(self.due[k]), truth=truth, **sensed)
+
+    def per_tick(self) -> dict[str, Any]:
+        """Return by name the arrays that hold what was measured and received at every tick."""
+        return {**self.measured(), "inbox_tick": self.inbox_tick}
 
     def odometry_age(self, rate: float) -> Array:
         """Return (K,) the age of the last odometry sample at each tick, s; samples are taken at 0, 1 / rate, ... s."""
@@ -201,10 +203,9 @@ class Recording(Measurements):
         return Sensed(
             index=np.arange(self.ticks)[:, None],  # type: ignore[arg-type]
             dt=self.dt,
-            pan=self.pan,
             odometry_age=self.odometry_age(odometry_rate)[:, None],
             truth=self.truth,
-            **{name: getattr(self, name) for name in PER_TICK},
+            **self.per_tick(),
         )
 
     def tick(self, k: int, vehicle: int, messages: Mapping[int, Received]) -> Tick:
@@ -278,10 +279,6 @@ def received_by_all(ticks: int, vehicles: int, period: int) -> NDArray[np.int64]
     inbox[0] = -1
     inbox[:, np.arange(vehicles), np.arange(vehicles)] = -1
     return inbox
-
-
-PER_TICK = (*MEASURED, "inbox_tick")
-"""Arrays of a recording that every tick of it has."""
 
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
@@ -366,8 +363,8 @@ def _check_radio(r: Recording) -> None:
 
 def recorded_arrays(r: Recording) -> dict[str, Any]:
     """Return the arrays of a recording by name. Raises DataError: one has another shape or type than it should."""
-    names = [name for name, spec in ARRAYS.items() if spec.recorded and (name != "pan" or r.pan is not None)]
-    values = {name: attrgetter(name)(r) for name in names}
+    values = {name: attrgetter(name)(r) for name, spec in ARRAYS.items() if spec.recorded}
+    values = {name: value for name, value in values.items() if value is not None or ARRAYS[name].optional is None}
     for problem in misshapen(values, {"K": r.ticks, **sizes_of(r.setups)}, {kind: kind for kind in "fib"}):
         raise DataError(problem)
     return values
@@ -409,7 +406,8 @@ def _check_scenario(r: Recording) -> None:
     neighbours = neighbour_sets(s)
     for setup, targets in zip(r.setups, neighbours, strict=True):
         _require(setup.targets.tolist() == targets, f"scenario: {setup.name} has other neighbours than in its setup")
-    _require((s.action.pan is None) == (r.pan is None), "pan: as in the scenario, cameras turn or they do not")
+    for name in recorded_arrays(r).keys() ^ set(recorded_names(s)):
+        _require(False, f"{name}: a recording has this array if its scenario asks for it, and only then")
     rates, staleness = s.rates, np.inf if s.v2x.staleness is None else s.v2x.staleness
     _require(list(r.order) == processing_order(s, neighbours), "scenario: vehicles in another order than recorded")
     _require(r.dt == 1.0 / rates.camera, f"scenario: ticks of {1.0 / rates.camera:g} s, recorded {r.dt:g} s")

@@ -43,6 +43,20 @@ class Measurements:
     bearings: Array  # (..., N, T, 3) camera -> target, body frame, NaN where not measured
     visible: NDArray[np.bool_]  # (..., N, T)
     landmarks: Array  # (..., L, 3) map, m
+    pan: Array | None = None  # (..., N) rad, by which cameras are turned to the left; None: 0
+
+    def measured(self) -> dict[str, Array]:
+        """Return the arrays of this class that are there, by name."""
+        return {name: value for name in MEASURED if (value := getattr(self, name)) is not None}
+
+    def filled(self, name: str) -> NDArray[Any]:
+        """Return an array; if it is absent, one of the value that stands for it."""
+        value: NDArray[Any] | None = getattr(self, name)
+        if value is None:
+            ticks, sizes = self.visible.shape[:-2], {"N": self.visible.shape[-2], "T": self.visible.shape[-1]}
+            shape = ARRAYS[name].shape({**sizes, "L": self.landmarks.shape[-2]})
+            value = np.full((*ticks, *shape), ARRAYS[name].optional, ARRAYS[name].dtype)
+        return value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +70,6 @@ class Sensed(Measurements):
     index: int  # k
     dt: float  # s, between ticks
     due: bool = True  # whether the scenario's observer rate asks for a correction
-    pan: Array | None = None  # (N,) rad, by which cameras are turned to the left; None: 0
     time: float | None = None  # s since the reset on the source's clock; None: index * dt
     odometry_age: Array | None = None  # (N,) s since the last odometry sample; None: 0
     bearing_age: Array | None = None  # (N,) s since the frame was exposed; None: 0
@@ -101,10 +114,12 @@ def is_due(index: ArrayLike, ratio: float) -> NDArray[np.bool_]:
 
 
 MEASURED = tuple(field.name for field in fields(Measurements))
-"""Arrays that every tick has."""
-
-
-ROWS_OF_MISSING = (*MEASURED[:6], "pan", "odometry_age", "bearing_age")
+"""Arrays of measurements."""
+REQUIRED = tuple(name for name in MEASURED if ARRAYS[name].optional is None)
+"""Arrays of measurements that every tick has."""
+ROWS_OF_MISSING = tuple(
+    name for name, spec in ARRAYS.items() if "N" in spec.axes and (name in MEASURED or not spec.recorded)
+)
 """Arrays of a tick of which the row of a missing vehicle is not read."""
 
 
@@ -122,7 +137,7 @@ def check_tick(tick: Sensed, index: int, observer_init: ObserverInit) -> None:
         raise CoopenvError(f"tick {index}: time: expected s since the reset, got {tick.time!r:.40}")
     names = [name for name, spec in ARRAYS.items() if spec.axes[0] == "K" and name != "due"]
     given = {name: attrgetter(name)(tick) for name in names if tick.truth is not None or "." not in name}
-    given = {name: value for name, value in given.items() if value is not None or name in MEASURED}
+    given = {name: value for name, value in given.items() if value is not None or name in REQUIRED}
     for problem in misshapen(given, sizes_of(observer_init.setups), KINDS_OF_TICKS):
         raise CoopenvError(f"tick {index}: {problem}")
     absent = given.get("missing", np.zeros(len(observer_init.setups), bool))

@@ -181,7 +181,7 @@ def run(
     """
     changes, log = with_observer(overrides, observer), Terminal(stderr=True)
     chosen = Selection.of(start, until, robots)
-    backend = open_backend(environment, None, changes, data, variant, topics=topics, selection=chosen)
+    backend = open_backend(environment, None, changes, chosen, data=data, variant=variant, topics=topics)
     with compile_notice(log):
         made = Rollout(backend.scenario, checked_seed(seed), steps, dtype, device, policy, backend)
     name, folder = source_name(environment), None if out is None else Path(out)

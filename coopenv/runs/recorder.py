@@ -10,7 +10,7 @@ from coopenv.episode import RECORDED, Episode, Origin, Views
 from coopenv.evaluation.episodes import play
 from coopenv.observers.faults import Interference, interference_of, stacked
 from coopenv.observers.recording import Drawn, Recording
-from coopenv.observers.sensed import MEASURED, Sensed, Truth, is_due
+from coopenv.observers.sensed import Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
 from coopenv.scenario import ScenarioLike
 from coopenv.sources.base import Backend
@@ -78,8 +78,7 @@ def record_episode(
         on_tick(engine, k)
         on_progress(k / scenario.horizon_ticks)
     L, observer_init = len(scenario.landmarks), engine.world.observer_init
-    names = MEASURED if scenario.action.pan is None else (*MEASURED, "pan")
-    kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in names}
+    kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in ticks[0].measured()}
     episode = views.episode(scenario, source_of(engine, name, seed, policy if isinstance(policy, str) else "custom"))
     recording = Recording(
         setups=observer_init.setups,

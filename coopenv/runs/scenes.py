@@ -20,7 +20,7 @@ from coopenv.base.installation import install_command, list_envs
 from coopenv.episode import SCENE_FILE, Episode, Origin, Views
 from coopenv.evaluation.episodes import play
 from coopenv.observers.recording import Recording
-from coopenv.observers.registry import find, named, observer_of_robots, with_observer
+from coopenv.observers.registry import named, observer_of_robots, with_observer
 from coopenv.policies import Policy, agents_for, find_agent, load_policy
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.recorder import record_episode, source_of
@@ -28,8 +28,6 @@ from coopenv.scenario import Scenario
 from coopenv.sources.base import Backend
 from coopenv.sources.mcap import log_views, write_recording
 from coopenv.sources.registry import kind_of
-from coopenv.sources.selection import WHOLE, Selection
-from coopenv.sources.sources import open_backend
 from coopenv.sources.worlds import Replay
 
 BASELINE = "route_follower"
@@ -135,27 +133,6 @@ def driver_of(
             except CoopenvError:
                 name = "zero"
     return load_policy(name, scenario, seed), Path(name).name
-
-
-def open_source(
-    name: str,
-    overrides: Mapping[str, Any],
-    observer: str | None = None,
-    data: Path | None = None,
-    variant: str | None = None,
-    topics: Path | None = None,
-    selection: Selection = WHOLE,
-) -> Backend:
-    """Return the source of ticks of a name: an environment, a log file, a bag or a data set.
-
-    Raises:
-        CoopenvError: there is no such thing, or it is of a form that cannot be opened.
-    """
-    if observer is not None:
-        find(named(observer))  # before anything is read
-    return open_backend(
-        name, None, with_observer(overrides, observer), data, variant, topics=topics, selection=selection
-    )
 
 
 def title_of(name: str) -> str:

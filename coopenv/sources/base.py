@@ -94,9 +94,9 @@ class Health:
 
     def count(self, tick: Sensed, vehicles: Any = slice(None)) -> None:
         """Count one tick, in the rows of some vehicles, or of all."""
-        missing = np.zeros(len(tick.visible), bool) if tick.missing is None else np.asarray(tick.missing, bool)
+        missing = np.asarray(tick.filled("missing"), bool)
         self.ticks += 1
-        self.late += 0 if tick.late is None else int(np.sum(tick.late[vehicles]))
+        self.late += int(np.sum(tick.filled("late")[vehicles]))
         self.missing += int(missing[vehicles].sum())
         self.empty += int((~np.any(tick.visible, axis=-1) & ~missing)[vehicles].sum())
 

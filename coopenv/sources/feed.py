@@ -17,12 +17,12 @@ from coopenv.observers.sensed import MEASURED, Sensed, Truth
 from coopenv.scenario.difficulty import PARAMETERS
 from coopenv.world.camera import MISSED, OUT_OF_VIEW, VISIBLE, camera_to_body, marker_position, sight_of
 from coopenv.world.dynamics import move
-from coopenv.world.embedded import Source, arrange_world, look_around, sense_nothing
+from coopenv.world.embedded import Source, arrange_world, begin_sensing, look_around, sense_nothing
 from coopenv.world.model import Precision
 from coopenv.world.nearby import NOT_A_NEIGHBOUR, sort_into_cells
 from coopenv.world.odometry import measure_odometry
 from coopenv.world.referee import ARRIVED, COLLIDED, depart, referee, touches_anything
-from coopenv.world.reset import begin_sensing, place_bodies, set_initial_estimate
+from coopenv.world.reset import place_bodies, set_initial_estimate
 from coopenv.world.route import UNDER_WAY
 from coopenv.world.state import allocate, array, fields
 from coopenv.world.v2x import draw_faults, transmit
@@ -88,7 +88,7 @@ def explain(model: Any, state: Any, world: int, vehicle: int):
 
 @wp.func
 def recall(model: Any, state: Any, record: Any, world: int, tick: int):
-    """Write the measurements of a tick, and the known truth."""
+    """Write the measurements of a tick, the messages that arrive, and the known truth."""
     row = row_of(record, tick)
     for landmark in range(model.landmarks):
         state.position[world, landmark] = record.landmarks[row, landmark]
@@ -114,12 +114,12 @@ def recall(model: Any, state: Any, record: Any, world: int, tick: int):
     sort_into_cells(model, state, world)
     for vehicle in range(model.vehicles):  # now that all poses are those of this tick
         explain(model, state, world, vehicle)
+    retransmit(model, state, record, world, tick, row)
 
 
 @wp.func
-def retransmit(model: Any, state: Any, record: Any, world: int, tick: int):
+def retransmit(model: Any, state: Any, record: Any, world: int, tick: int, row: int):
     """Write which messages arrive at a tick, by the source or else by the scenario's radio."""
-    row = row_of(record, tick)
     if record.inbox_tick[row, 0, 0] == BY_RADIO:
         for receiver in range(model.vehicles):
             transmit(model, state, world, receiver, tick)
@@ -139,7 +139,6 @@ def resense(model: Any, state: Any, record: Any, world: int, tick: int):
     recall(model, state, record, world, tick)
     for vehicle in range(model.vehicles):
         referee(model, state, world, vehicle)
-    retransmit(model, state, record, world, tick)
 
 
 @wp.func
@@ -165,7 +164,6 @@ def rewind(model: Any, state: Any, record: Any, world: int):
     recall(model, state, record, world, 0)
     for vehicle in range(model.vehicles):
         state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
-    retransmit(model, state, record, world, 0)
 
 
 @cache
@@ -223,17 +221,15 @@ class Feed:
         """Write a tick, or all ticks of a recording as one, and the twists that lead there from the truth before."""
         truth = tick.truth or unknown_truth(tick)
         linear, angular = mean_twists(before, truth, tick.dt)
-        age = np.zeros(1) if tick.odometry_age is None else np.asarray(tick.odometry_age)
-        missing = np.zeros(1, bool) if tick.missing is None else np.asarray(tick.missing)
+        age = tick.filled("odometry_age")
         sampled = (tick.index * tick.dt - age + 1e-9) * self._odometry_rate
-        just_before = ~missing & np.isfinite(age)  # the first tick
+        just_before = ~tick.filled("missing") & np.isfinite(age)  # the first tick
         samples = np.where((sampled >= 0.0) | just_before, np.floor(np.maximum(sampled, 0.0)) + 1, 0)
-        lag = np.zeros(1) if tick.bearing_age is None else np.asarray(tick.bearing_age) / tick.dt
+        lag = tick.filled("bearing_age") / tick.dt
         values = {
-            **{name: getattr(tick, name) for name in MEASURED},
+            **{name: tick.filled(name) for name in MEASURED},
             "samples": samples,
             "bearing_lag": np.round(np.minimum(lag, tick.index)),
-            "pan": 0.0 if tick.pan is None else tick.pan,
             "inbox_tick": BY_RADIO if tick.inbox_tick is None else tick.inbox_tick,
             "true_rotation": truth.rotation,
             "true_position": truth.position,

@@ -18,9 +18,9 @@ from coopenv.base.files import check_file, replacing_file
 from coopenv.base.installation import version
 from coopenv.base.plugins import loaded, offered
 from coopenv.base.sections import validated
-from coopenv.observers.arrays import ARRAYS, sizes_of
+from coopenv.observers.arrays import ARRAYS, recorded_names, sizes_of
 from coopenv.observers.contract import Setup
-from coopenv.observers.recording import Recording, check_recording
+from coopenv.observers.recording import Recording, check_recording, recorded_arrays
 from coopenv.observers.sensed import Truth
 from coopenv.sources.mcap_format import (
     ATTACHMENT,
@@ -45,23 +45,21 @@ if TYPE_CHECKING:
 
 
 class TickArrays:
-    """The arrays of a recording while its messages come in; `pan`: whether cameras turn."""
+    """The arrays of a recording while its messages come in."""
 
-    def __init__(self, ticks: int, setups: Sequence[Setup], pan: bool) -> None:
-        """Allocate the arrays. Raises CoopenvError: they would not fit into memory."""
+    def __init__(self, ticks: int, setups: Sequence[Setup], names: Sequence[str]) -> None:
+        """Allocate the arrays of these names. Raises CoopenvError: they would not fit into memory."""
         vehicles, sizes = [setup.name for setup in setups], {"K": ticks, **sizes_of(setups)}
-        kept = [n for n, spec in ARRAYS.items() if spec.recorded and spec.axes[0] == "K" and (n != "pan" or pan)]
-        shapes = {name: ARRAYS[name].shape(sizes) for name in kept}
+        shapes = {name: ARRAYS[name].shape(sizes) for name in names if ARRAYS[name].axes[0] == "K"}
         needed = 8 * sum(math.prod(shape) for shape in shapes.values())
         check_memory(needed, f"a recording of {ticks} ticks, {len(vehicles)} vehicles and {sizes['T']} targets")
         self._shape_of_landmarks = shapes.pop("landmarks")[1:]
         shapes["due"] = (ticks, len(vehicles))
-        dtypes: dict[str, Any] = {"b": np.bool_, "i": np.int64, "f": np.float64}
         # zeros take no memory before they are written to
-        self._arrays = {name: np.zeros(shape, dtypes[ARRAYS[name].kind]) for name, shape in shapes.items()}
+        self._arrays = {name: np.zeros(shape, ARRAYS[name].dtype) for name, shape in shapes.items()}
         self._ticks, self._targets = ticks, sizes["T"]
         self._landmarks: dict[int, np.ndarray] = {}
-        exact = exact_topics(pan)
+        exact = exact_topics(names)
         self._places = {topic(name, field): (field, i) for i, name in enumerate(vehicles) for field in exact}
         self.kinds = {LANDMARKS: LANDMARKS_TYPE} | {name: exact[field] for name, (field, _) in self._places.items()}
         """Topic to the type of its messages."""
@@ -136,9 +134,7 @@ def read_recording(path: str | Path) -> Recording:
 def _read(container: Container, where: str) -> Recording:
     header = _header(container, where)
     constants = header.constants(f"{where}: {ATTACHMENT}")
-    scenario = constants["scenario"]
-    pan = scenario is not None and scenario.action.pan is not None
-    ticks = TickArrays(header.ticks, constants["setups"], pan)
+    ticks = TickArrays(header.ticks, constants["setups"], recorded_names(constants["scenario"]))
     for channel, schema, message in container.messages():
         kind = ticks.kinds.get(channel.topic)
         if kind is None:
@@ -213,7 +209,7 @@ class _Log(RosLog):
     def __init__(self, stream: Any, recording: Recording, clock: LogClock) -> None:
         super().__init__(stream)
         self.recording, self.clock, self.codec = recording, clock, codec()
-        self.exact = exact_topics(recording.pan is not None)
+        self.exact = exact_topics(recorded_arrays(recording))
         self.types = {name.removeprefix("geometry_msgs/msg/"): kind for name, kind in self.codec.types.items()}
 
     def write(self, views: Sequence[View]) -> None:

@@ -8,7 +8,7 @@ setups, gains, noise, starts, scenario. `metadata_names` and `is_cut_off` look i
 import json
 import math
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from functools import cache
@@ -62,9 +62,9 @@ def topic(vehicle: str, name: str) -> str:
     return f"/{vehicle}/{name}"
 
 
-def exact_topics(pan: bool) -> dict[str, str]:
-    """Return `EXACT`; without `pan`, where no camera turns, without that topic."""
-    return {name: kind for name, kind in EXACT.items() if pan or name != "pan"}
+def exact_topics(arrays: Collection[str]) -> dict[str, str]:
+    """Return the topics of `EXACT` for a recording that has these arrays."""
+    return {name: kind for name, kind in EXACT.items() if set(CONTENTS[name].values()) <= set(arrays)}
 
 
 @cache

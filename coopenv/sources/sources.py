@@ -128,11 +128,8 @@ def open_backend(
     name_or_path: ScenarioLike | Recording,
     backend: str | Backend | None,
     overrides: Mapping[str, Any],
-    data: str | Path | None = None,
-    variant: str | None = None,
-    options: Mapping[str, Any] | None = None,
-    topics: str | Path | None = None,
     selection: Selection = WHOLE,
+    **options: Any,
 ) -> Backend:
     """Return the source of ticks of an environment or a recording.
 
@@ -141,17 +138,14 @@ def open_backend(
         backend: "simulated", a co-simulator, "replay" or a kind that is not recorded; None: by the name; a
             backend itself is returned as it is.
         overrides: dotted scenario keys.
-        data: folder of the data sets.
-        variant: of a data set.
-        options: further options of a kind, such as `deployment`, `car`, `record` and `connect` of cars.
-        topics: map of the topics of a ROS bag.
         selection: the part of recorded data that is used.
+        options: of kinds by name (`SourceKind.options`), such as `data` and `variant` of data sets, `topics` of ROS
+            bags, `deployment`, `car`, `record` and `connect` of cars; None: not given.
 
     Raises:
         CoopenvError: any of it does not exist or does not fit.
     """
-    files = {"data": data, "variant": variant, "topics": topics}
-    given = {name: value for name, value in {**files, **(options or {})}.items() if value is not None}
+    given = {name: value for name, value in options.items() if value is not None}
     if _is_backend(backend):
         for name in {**overrides, **given, **selection.given}:
             raise CoopenvError(f"{name}: {type(backend).__name__} has its scenario already, choose it there")
@@ -163,7 +157,7 @@ def open_backend(
         from coopenv.sources.worlds import Replay
 
         return Replay(selection.applied(name_or_path, OBJECT), OBJECT, overrides)
-    kind = kind_of(name_or_path, topics)
+    kind = kind_of(name_or_path, given.get("topics"))
     if backend == "replay":
         kind = kind if kind.recorded else LOG
     elif backend is not None:

@@ -13,7 +13,7 @@ from coopenv.observers.contract import Message, ObserverInit
 from coopenv.observers.kernel_observer import views_of
 from coopenv.observers.registry import find_embedded
 from coopenv.observers.runner import start_covariances
-from coopenv.observers.sensed import MEASURED, Sensed, check_tick, is_due
+from coopenv.observers.sensed import Sensed, check_tick, is_due
 from coopenv.sources.base import (
     Backend,
     Broadcasting,
@@ -157,25 +157,22 @@ class TickWorld(SensingWorld):
 
     def _completed(self, tick: Sensed) -> Sensed:
         """Return a sealed tick without gaps: a missing vehicle continues with its last odometry."""
-        N, last = len(tick.rotation), self._present
-        arrays: dict[str, Any] = {name: np.array(getattr(tick, name), dtype=float) for name in MEASURED}
+        last, missing = self._present, np.array(tick.filled("missing"), bool)
+        ages = {name: tick.filled(name) for name in ("odometry_age", "bearing_age")}
+        arrays: dict[str, Any] = {name: np.array(value, float) for name, value in (tick.measured() | ages).items()}
         arrays["visible"] = tick.visible.copy()
-        arrays.update({name: _or_zeros(getattr(tick, name), N) for name in ("odometry_age", "bearing_age")})
-        missing, late = (_or_zeros(flags, N).astype(bool) for flags in (tick.missing, tick.late))
         for i in np.flatnonzero(missing):
             turn, step = last.angular_velocity[i] * tick.dt, last.velocity[i] * tick.dt
             arrays["rotation"][i], arrays["translation"][i] = exp_so3(turn), exp_translation(turn, step)
-        for name in ("velocity", "angular_velocity"):
-            arrays[name][missing] = getattr(last, name)[missing]
-        arrays["odometry_age"][missing] = np.asarray(last.odometry_age)[missing] + tick.dt
-        if tick.pan is not None:
-            arrays["pan"] = np.where(missing, 0.0 if last.pan is None else last.pan, tick.pan)
+        for name in arrays.keys() & {"velocity", "angular_velocity", "pan"}:
+            arrays[name][missing] = last.filled(name)[missing]
+        arrays["odometry_age"][missing] = last.filled("odometry_age")[missing] + tick.dt
         arrays["visible"][missing] = False
         arrays["bearings"][~arrays["visible"]] = np.nan
         for values in arrays.values():
             values.setflags(write=False)
         due = bool(is_due(tick.index, self.model.observer.rate / self.scenario.rates.camera))
-        return replace(tick, **arrays, missing=missing, late=late, due=due)
+        return replace(tick, **arrays, missing=missing, late=np.array(tick.filled("late"), bool), due=due)
 
     def _receive(self) -> None:
         """Put messages from vehicles that are estimated elsewhere into the inboxes; malformed ones are as none."""
@@ -256,7 +253,3 @@ def _nothing(observer_init: ObserverInit) -> Sensed:
         landmarks=np.zeros((observer_init.setups[0].landmarks, 3)),
         odometry_age=np.full(N, np.inf),
     )
-
-
-def _or_zeros(values: Any, count: int) -> np.ndarray:
-    return np.zeros(count) if values is None else np.array(values, dtype=float)

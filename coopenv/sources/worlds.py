@@ -13,8 +13,8 @@ import warp as wp
 from coopenv.base.errors import CoopenvError, DataError, ScenarioWarning
 from coopenv.estimation import Sight
 from coopenv.observers.arrays import ARRAYS
-from coopenv.observers.contract import ObserverInit, sealed
-from coopenv.observers.recording import Recording, check_recording, recorded_arrays
+from coopenv.observers.contract import ObserverInit
+from coopenv.observers.recording import Recording, check_recording
 from coopenv.observers.registry import find_embedded
 from coopenv.observers.runner import start_covariances
 from coopenv.observers.sensed import Sensed, Truth, is_due
@@ -55,11 +55,12 @@ class SimulatedWorld(SensingWorld):
             "visible": visible,
             "landmarks": position + (R @ self._markers)[..., 0],
         }
+        if ARRAYS["pan"].present(self.scenario):
+            arrays["pan"] = self._copy("pan", world)
         for values in arrays.values():
             values.setflags(write=False)
-        pan = None if self.scenario.action.pan is None else sealed(self._copy("pan", world))
         due = bool(is_due(k, self.model.observer.rate / rates.camera))
-        return Sensed(index=k, dt=1.0 / rates.camera, due=due, pan=pan, **arrays)
+        return Sensed(index=k, dt=1.0 / rates.camera, due=due, **arrays)
 
     def full_tick(self, k: int) -> Sensed:
         """Return the tick of the first world with truth and deliveries."""
@@ -276,8 +277,7 @@ def stretch(recording: Recording, first: int, last: int, where: str) -> Recordin
         later = np.flatnonzero(known[first:])
         hint = f"; they are at {(first + later[0]) * recording.dt:g} s" if len(later) else ""
         raise DataError(f"{where}: from: true poses of all robots are not known at {first * recording.dt:g} s{hint}")
-    names = [name for name in recorded_arrays(recording) if ARRAYS[name].axes[0] == "K" and "." not in name]
-    arrays: dict[str, Any] = {name: np.array(getattr(recording, name)[cut]) for name in names}
+    arrays: dict[str, Any] = {name: np.array(values[cut]) for name, values in recording.per_tick().items()}
     arrays["rotation"][0], arrays["translation"][0] = np.eye(3), 0.0
     arrays["inbox_tick"] = np.where(arrays["inbox_tick"] >= first, arrays["inbox_tick"] - first, -1)
     arrays["due"] = recording.due[: last + 1 - first]

@@ -17,11 +17,11 @@ from coopenv.world.camera import observe
 from coopenv.world.dynamics import move, move_landmarks
 from coopenv.world.model import Precision
 from coopenv.world.nearby import sort_into_cells
-from coopenv.world.odometry import measure_odometry
-from coopenv.world.referee import depart, referee
-from coopenv.world.reset import begin_sensing, place_bodies
+from coopenv.world.odometry import draw_errors, measure_odometry
+from coopenv.world.referee import depart, referee, touches_anything
+from coopenv.world.reset import place_bodies, set_initial_estimate
 from coopenv.world.route import appear, direct_traffic
-from coopenv.world.v2x import transmit
+from coopenv.world.v2x import draw_faults, transmit
 from coopenv.world.warp_internals import device_function
 
 
@@ -174,6 +174,27 @@ HOST = Embedded("host", estimate_nothing, start_nothing, send_nothing)
 
 
 @device_function
+def sense_vehicle(model: Any, state: Any, world: int, vehicle: int, tick: int):
+    """Run the sensing stages of a vehicle, at the start of an episode (tick 0) as at every tick."""
+    observe(model, state, world, vehicle, tick)
+    transmit(model, state, world, vehicle, tick)
+    direct_traffic(model, state, world, vehicle, tick)
+
+
+@device_function
+def begin_sensing(model: Any, state: Any, world: int):
+    """Draw initial estimates and lasting errors, look for contact, take the first frame."""
+    sort_into_cells(model, state, world)
+    for vehicle in range(model.vehicles):
+        set_initial_estimate(model, state, world, vehicle)
+        draw_errors(model, state, world, vehicle)
+        draw_faults(model, state, world, vehicle)
+        state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
+    for vehicle in range(model.vehicles):
+        sense_vehicle(model, state, world, vehicle, 0)
+
+
+@device_function
 def begin_simulation(model: Any, state: Any, record: Any, world: int):
     """Draw the start of an episode, and take the first frame."""
     place_bodies(model, state, world)
@@ -200,9 +221,7 @@ def arrange_world(model: Any, state: Any, record: Any, world: int, tick: int):
 def look_around(model: Any, state: Any, record: Any, world: int, vehicle: int, tick: int):
     """Judge where a vehicle is, and take its camera frame and its messages."""
     referee(model, state, world, vehicle)
-    observe(model, state, world, vehicle, tick)
-    transmit(model, state, world, vehicle, tick)
-    direct_traffic(model, state, world, vehicle, tick)
+    sense_vehicle(model, state, world, vehicle, tick)
 
 
 SIMULATED = Source(

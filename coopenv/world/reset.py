@@ -1,4 +1,4 @@
-"""Start an episode: draw presence, poses and initial estimates, and take the first frame.
+"""Start an episode: draw presence, poses and initial estimates.
 
 An absent agent is neither seen nor a body. Presence is drawn at a reset and changed by vehicles that leave.
 """
@@ -8,11 +8,9 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import exp_so3, identity3, join6, orthonormalise
-from coopenv.world.camera import observe
 from coopenv.world.dynamics import command_of, prescribe
 from coopenv.world.model import DRIVEN, PRESCRIBED
-from coopenv.world.nearby import clear_cells, clear_entries, put_into_cell, sort_into_cells
-from coopenv.world.odometry import draw_errors
+from coopenv.world.nearby import clear_cells, clear_entries, put_into_cell
 from coopenv.world.quality import empty_block
 from coopenv.world.random import (
     INITIAL_ERROR,
@@ -31,9 +29,9 @@ from coopenv.world.random import (
     uniform,
     unit_vector,
 )
-from coopenv.world.referee import touches_anything, touches_one_of
-from coopenv.world.route import direct_traffic, draw_route, go_straight, has_routes, start_on_route
-from coopenv.world.v2x import NOTHING, POSE_BYTES, draw_faults, first_tick_of, transmit
+from coopenv.world.referee import touches_one_of
+from coopenv.world.route import draw_route, go_straight, has_routes, start_on_route
+from coopenv.world.v2x import NOTHING, POSE_BYTES, first_tick_of
 
 ABSENT = wp.constant(-1)
 """Value of `ended` of a vehicle that is absent in this episode."""
@@ -286,18 +284,3 @@ def place_bodies(model: Any, state: Any, world: int):
         put_into_cell(model, state, world, agent, state.position[world, agent])
     for vehicle in range(model.vehicles):
         place_vehicle(model, state, world, vehicle)
-
-
-@wp.func
-def begin_sensing(model: Any, state: Any, world: int):
-    """Draw initial estimates and lasting errors, look for contact, take the first frame."""
-    sort_into_cells(model, state, world)
-    for vehicle in range(model.vehicles):
-        set_initial_estimate(model, state, world, vehicle)
-        draw_errors(model, state, world, vehicle)
-        draw_faults(model, state, world, vehicle)
-        state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
-    for vehicle in range(model.vehicles):
-        observe(model, state, world, vehicle, 0)
-        transmit(model, state, world, vehicle, 0)
-        direct_traffic(model, state, world, vehicle, 0)

@@ -10,7 +10,7 @@ import numpy as np
 
 from coopenv.mrclam.dataset import MotionCapture, Robot
 from coopenv.mrclam.recording import Dataset, recording_of
-from coopenv.observers.recording import PER_TICK, Recording
+from coopenv.observers.recording import Recording
 
 ORIGIN = 1248444187.0
 LANDMARKS = {6: (0.0, 4.0), 7: (4.0, 0.0), 8: (-4.0, 0.0), 9: (0.0, -4.0), 10: (3.0, 3.0)}
@@ -179,7 +179,7 @@ def carried_off(seed: int, robot: int, at: float, seconds: float = 150.0) -> Rec
     """
     before, after = (recording_of(barrier_robots(s, seconds), "landmarks") for s in (seed, seed + 1000))
     k = round(at / before.dt)
-    changed = {name: getattr(before, name).copy() for name in (*PER_TICK,)}
+    changed = {name: values.copy() for name, values in before.per_tick().items()}
     for name in ("rotation", "translation", "velocity", "angular_velocity", "bearings", "visible"):
         changed[name][k:, robot] = getattr(after, name)[k:, robot]
     truth = replace(before.truth, rotation=before.truth.rotation.copy(), position=before.truth.position.copy())

@@ -22,8 +22,9 @@ from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.episode import Origin
 from coopenv.runs.live import FAULTS, EngineReel, Reel, vehicle_index
-from coopenv.runs.scenes import driver_of, open_source, scene_of
+from coopenv.runs.scenes import driver_of, scene_of
 from coopenv.runs.view import Viewer
+from coopenv.sources.sources import open_backend
 from coopenv.viz.web import free_port, guarded_server
 from tests.helpers.fleet import Fleet
 from tests.helpers.processes import wait_until
@@ -33,7 +34,7 @@ pytest.importorskip("viser", reason="needs the extra view")
 
 def reel_of(name: str, **overrides: Any) -> EngineReel:
     changes = {"horizon": 4.0, **overrides}
-    opened = lambda more: open_source(name, {**changes, **more})  # noqa: E731
+    opened = lambda more: open_backend(name, None, {**changes, **more})  # noqa: E731
     return EngineReel(opened, name, 3, lambda scenario: driver_of(None, scenario, name, 3))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from coopenv import DataError
@@ -19,7 +19,9 @@ from coopenv.cli.app import main
 from coopenv.mrclam.recording import load_dataset, recording_of
 from coopenv.observers import Recording, run
 from coopenv.observers.sensed import Truth
+from coopenv.scenario import parse_scenario
 from coopenv.sources.mcap import read_recording, write_recording
+from coopenv.sources.mcap_container import Container
 from tests.helpers import mrclam_files
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import differences, simulated
@@ -220,3 +222,30 @@ def test_a_log_of_version_0_2_still_replays() -> None:
     """`overtaking`, seed 3, 1 s, written by version 0.2; the final errors, m, are those that it computed itself."""
     found = run("riccati", read_recording(Path(__file__).parent / "data" / "overtaking_0.2.mcap"))
     assert_allclose(found.position_error[-1], [0.11374381960407857, 0.035937081495087564], rtol=1e-6)
+
+
+def messages(path: Path) -> list[tuple[str, int, int, bytes]]:
+    """Return topic, tick, time in ns and contents of the messages of a log."""
+    found = Container(path).messages()
+    return [(channel.topic, message.sequence, message.log_time, message.data) for channel, _, message in found]
+
+
+def test_a_log_of_version_0_2_is_written_again_byte_for_byte(tmp_path: Path) -> None:
+    saved, again = Path(__file__).parent / "data" / "overtaking_0.2.mcap", tmp_path / "again.mcap"
+    write_recording(read_recording(saved), again, start=messages(saved)[0][2] / 1e9)
+    assert messages(again) == messages(saved)
+
+
+def test_an_array_that_may_be_absent_is_in_a_log_if_the_scenario_has_it(tmp_path: Path) -> None:
+    plain = read_recording(Path(__file__).parent / "data" / "overtaking_0.2.mcap")
+    assert plain.pan is None and plain.scenario is not None
+    assert_array_equal(plain.filled("pan"), np.zeros((plain.ticks, len(plain.setups))))
+    keys = plain.scenario.model_dump()
+    keys["action"]["pan"] = {"limit": 1.0, "rate": 2.0}
+    turning = parse_scenario(keys, "turning cameras")
+    made = replace(plain, scenario=turning, pan=np.linspace(0.0, 1.0, 2 * plain.ticks).reshape(-1, 2))
+    assert differences(made, through(made, tmp_path)) == []
+    assert {"/vehicle_1/pan", "/vehicle_2/pan"} == {m[0] for m in messages(tmp_path / "drive.mcap") if "pan" in m[0]}
+    for contradictory in (replace(made, pan=None), replace(plain, pan=made.pan)):
+        with pytest.raises(DataError, match=r"recording: pan: "):
+            write_recording(contradictory, tmp_path / "no.mcap")

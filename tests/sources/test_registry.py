@@ -63,7 +63,7 @@ def test_a_source_of_another_package_is_opened_by_its_name(capsys: pytest.Captur
     [
         ("twin:failing", {}, r"twin:open_twin fails: RuntimeError: no link"),
         ("twin", {"data": "."}, "data is for recorded data, 'twin' is a twin"),
-        ("twin", {"options": {"car": "a"}}, "car is for backend='svea', 'twin' is a twin"),
+        ("twin", {"car": "a"}, "car is for backend='svea', 'twin' is a twin"),
         ("x.ours", {}, r"twin:nothing fails: AttributeError"),
         ("absent", {}, r"source 'absent' \(no_such_module:KIND\) cannot be loaded: ModuleNotFoundError"),
         ("facade", {"backend": "absent"}, "source 'absent'.*cannot be loaded"),

@@ -5,9 +5,12 @@ Numbers are float32 in worlds of either precision. A field of the observation ta
 terminations may take `TruthRecord`, reward terms `FleetRecord` too, and are then privileged. Observations therefore
 cannot leak truth.
 
-Values stand in the order of their rows in `coopenv.scenario.terms`, and in their units; the results kernel scales and
-clips them.
+Values stand at the places of their rows in `coopenv.scenario.terms`, which `FieldPlace` gives by name, and in their
+units; the results kernel scales and clips them.
 """
+
+from enum import IntEnum
+from typing import Any
 
 import warp as wp
 
@@ -148,6 +151,16 @@ for _name, _row in OBSERVATION_FIELDS.built_in.items():
 VehicleValues, TargetValues, NeighbourValues, LandmarkValues = (
     wp.types.vector(size, wp.float32) for size in _sizes.values()
 )
+FieldPlace: Any = IntEnum("FieldPlace", SOURCES)
+"""First place of a built-in field by its name, for kernels."""
+
+
+@wp.func
+def put(values: Any, place: int, vector: Any):
+    """Return values with the entries of a vector from a place on."""
+    for k in range(len(vector)):
+        values[place + k] = vector[k]
+    return values
 
 
 @wp.func
@@ -198,79 +211,77 @@ def log10_of_std(std: wp.float32) -> wp.float32:
 @wp.func
 def vehicle_values(ego: Ego) -> VehicleValues:
     """Return the values of the fields with one value per vehicle."""
-    place, R, P = ego.position_estimate, ego.rotation_estimate, ego.covariance
-    velocity, turn_rate, goal = ego.velocity, ego.angular_velocity, ego.goal
-    std, ahead, action = ego.axis_std, ego.route_ahead, ego.action
-    return VehicleValues(
-        place[0], place[1], place[2],  # estimate_position
-        R[0, 0], R[1, 0], R[2, 0],  # estimate_forward
-        R[0, 1], R[1, 1], R[2, 1],  # estimate_left
-        log10(P[0, 0]), log10(P[1, 1]), log10(P[2, 2]),  # covariance_diagonal
-        log10(P[3, 3]), log10(P[4, 4]), log10(P[5, 5]),
-        ego.mean_log_variance,  # log_determinant
-        log10(wp.max(ego.gramian_min_eigenvalue, EIGENVALUE_FLOOR)),  # gramian_min_eigenvalue
-        wp.float32(ego.targets_in_view),
-        velocity[0], velocity[1], velocity[2],
-        turn_rate[0], turn_rate[1], turn_rate[2],  # angular_velocity
-        ego.odometry_age,
-        goal[0], goal[1], goal[2],
-        log10_of_std(ego.position_std),  # position_std
-        log10_of_std(std[0]), log10_of_std(std[1]), log10_of_std(std[2]),  # axis_std
-        log10_of_std(ego.heading_std),  # heading_std
-        ego.soft_observability,
-        log10_of_std(ego.protection_level[0]),  # protection_position
-        log10_of_std(ego.protection_level[1]),  # protection_angle
-        ego.route_offset, ego.route_heading, ego.route_left,
-        ahead[0], ahead[1], ahead[2], ahead[3],  # route_ahead
-        ego.steering,
-        action[0], action[1], action[2],  # last_action
-        ego.time_left,
-        ego.pan,  # camera_pan
-    )  # fmt: skip
+    R, P, std = ego.rotation_estimate, ego.covariance, ego.axis_std
+    values = VehicleValues()
+    values = put(values, FieldPlace.estimate_position, ego.position_estimate)
+    values = put(values, FieldPlace.estimate_forward, wp.vec3(R[0, 0], R[1, 0], R[2, 0]))
+    values = put(values, FieldPlace.estimate_left, wp.vec3(R[0, 1], R[1, 1], R[2, 1]))
+    for k in range(6):
+        values[FieldPlace.covariance_diagonal + k] = log10(P[k, k])
+    values[FieldPlace.log_determinant] = ego.mean_log_variance
+    values[FieldPlace.gramian_min_eigenvalue] = log10(wp.max(ego.gramian_min_eigenvalue, EIGENVALUE_FLOOR))
+    values[FieldPlace.targets_in_view] = wp.float32(ego.targets_in_view)
+    values = put(values, FieldPlace.velocity, ego.velocity)
+    values = put(values, FieldPlace.angular_velocity, ego.angular_velocity)
+    values[FieldPlace.odometry_age] = ego.odometry_age
+    values = put(values, FieldPlace.goal, ego.goal)
+    values[FieldPlace.position_std] = log10_of_std(ego.position_std)
+    values = put(values, FieldPlace.axis_std, wp.vec3(log10_of_std(std[0]), log10_of_std(std[1]), log10_of_std(std[2])))
+    values[FieldPlace.heading_std] = log10_of_std(ego.heading_std)
+    values[FieldPlace.soft_observability] = ego.soft_observability
+    values[FieldPlace.protection_position] = log10_of_std(ego.protection_level[0])
+    values[FieldPlace.protection_angle] = log10_of_std(ego.protection_level[1])
+    values[FieldPlace.route_offset] = ego.route_offset
+    values[FieldPlace.route_heading] = ego.route_heading
+    values[FieldPlace.route_left] = ego.route_left
+    values = put(values, FieldPlace.route_ahead, ego.route_ahead)
+    values[FieldPlace.steering] = ego.steering
+    values = put(values, FieldPlace.last_action, ego.action)
+    values[FieldPlace.time_left] = ego.time_left
+    values[FieldPlace.camera_pan] = ego.pan
+    return values
 
 
 @wp.func
 def target_values(target: Target) -> TargetValues:
     """Return the values of the fields with one value per landmark and vehicle."""
-    bearing = target.bearing
-    return TargetValues(
-        bearing[0], bearing[1], bearing[2],
-        wp.float32(target.in_view),  # bearing_mask
-        target.age,  # bearing_age
-    )  # fmt: skip
+    values = TargetValues()
+    values = put(values, FieldPlace.bearing, target.bearing)
+    values[FieldPlace.bearing_mask] = wp.float32(target.in_view)
+    values[FieldPlace.bearing_age] = target.age
+    return values
 
 
 @wp.func
 def neighbour_values(ego: Ego, neighbour: Neighbour, clearance: bool) -> NeighbourValues:
     """Return the values of the fields with one value per other vehicle; those of `message_clearance` on demand."""
-    place, R, sighting = neighbour.position, neighbour.rotation, neighbour.bearing
+    place, R = neighbour.position, neighbour.rotation
     driving, standing = FAR, FAR
     if clearance and neighbour.received:
         position, forward = wp.vec2(place[0], place[1]), wp.vec2(R[0, 0], R[1, 0])
         driving = closest_approach_driving(ego.route_ahead, ego.route_step, ego.top_speed, position, forward)
         standing = wp.min(FAR, closest_on_segment(position, ego.top_speed * forward, FORESIGHT))
-    return NeighbourValues(
-        place[0], place[1], place[2],  # message_position
-        R[0, 0], R[1, 0], R[2, 0],  # message_forward
-        wp.float32(neighbour.received),  # message_mask
-        neighbour.age,  # message_age
-        driving, standing,  # message_clearance
-        wp.float32(neighbour.precedes),  # message_precedence
-        sighting[0], sighting[1], sighting[2],
-        wp.float32(neighbour.in_view),  # sighting_mask
-        neighbour.bearing_age,  # sighting_age
-        wp.float32(neighbour.sees),  # seen_mask
-        neighbour.seen_age,
-    )  # fmt: skip
+    values = NeighbourValues()
+    values = put(values, FieldPlace.message_position, place)
+    values = put(values, FieldPlace.message_forward, wp.vec3(R[0, 0], R[1, 0], R[2, 0]))
+    values[FieldPlace.message_mask] = wp.float32(neighbour.received)
+    values[FieldPlace.message_age] = neighbour.age
+    values = put(values, FieldPlace.message_clearance, wp.vec2(driving, standing))
+    values[FieldPlace.message_precedence] = wp.float32(neighbour.precedes)
+    values = put(values, FieldPlace.sighting, neighbour.bearing)
+    values[FieldPlace.sighting_mask] = wp.float32(neighbour.in_view)
+    values[FieldPlace.sighting_age] = neighbour.bearing_age
+    values[FieldPlace.seen_mask] = wp.float32(neighbour.sees)
+    values[FieldPlace.seen_age] = neighbour.seen_age
+    return values
 
 
 @wp.func
 def landmark_values(landmark: MapLandmark) -> LandmarkValues:
     """Return the values of the fields with one value per landmark of the map."""
-    place = landmark.position
-    return LandmarkValues(
-        place[0], place[1], place[2],  # map_position
-        wp.float32(landmark.exists),  # map_mask
-        wp.float32(landmark.expected),  # map_in_view
-        landmark.age,  # map_age
-    )  # fmt: skip
+    values = LandmarkValues()
+    values = put(values, FieldPlace.map_position, landmark.position)
+    values[FieldPlace.map_mask] = wp.float32(landmark.exists)
+    values[FieldPlace.map_in_view] = wp.float32(landmark.expected)
+    values[FieldPlace.map_age] = landmark.age
+    return values

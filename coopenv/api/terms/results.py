@@ -1,10 +1,11 @@
 """The results of a step: observation, reward, flags, quality of the estimate; one kernel per precision.
 
-The kernel computes the values of all built-in terms and reads from a table which of them an observation holds. Reward
-terms stand in the order of their rows in `coopenv.scenario.terms`. User terms have kernels of their own (`own.py`),
-which read the records that this kernel writes for them.
+The kernel computes the values of all built-in terms and reads from a table which of them an observation holds. Values
+of reward terms stand at the places of their rows in `coopenv.scenario.terms`, which `RewardPlace` gives by name. User
+terms have kernels of their own (`own.py`), which read the records that this kernel writes for them.
 """
 
+from enum import IntEnum
 from functools import cache
 from typing import Any
 
@@ -228,6 +229,8 @@ def is_over(model: Any, state: Any, world: int) -> bool:
 
 
 RewardValues = wp.types.vector(len(REWARD_TERMS.built_in), wp.float32)
+RewardPlace: Any = IntEnum("RewardPlace", {name: place for place, name in enumerate(REWARD_TERMS.built_in)})
+"""Place of a built-in reward term by its name, for kernels."""
 
 
 @wp.func
@@ -243,24 +246,24 @@ def reward_values(ego: Ego, truth: TruthRecord) -> RewardValues:
     threshold, cap = ego.uncertainty_threshold, ego.uncertainty_cap
     shortfall = ego.observability_level - ego.soft_observability
     largest_shortfall = wp.max(ego.observability_level - ego.observability_floor, 0.0)
-    return RewardValues(
-        truth.progress,
-        wp.float32(ego.arrived),  # arrival
-        wp.where(ego.outcome == COLLIDED, -1.0, 0.0),  # collision
-        wp.where(ego.outcome == OFF_ROUTE, -1.0, 0.0),  # off_route
-        -ego.effort,  # control
-        -ego.elapsed,  # time
-        -0.001 * wp.float32(ego.bytes_sent),  # radio
-        -truth.position_error,
-        -(truth.orientation_error / DEGREES),
-        per_metre(ego, ego.position_std - threshold, cap),  # position_uncertainty
-        per_metre(ego, truth.position_error - threshold, cap),  # position_error_per_metre
-        ego.information_gained,  # information_gain
-        -ego.log_determinant / 6.0,  # uncertainty
-        log10(wp.max(ego.gramian_min_eigenvalue, EIGENVALUE_FLOOR)),  # observability
-        per_metre(ego, shortfall, largest_shortfall),  # observability_shortfall
-        wp.float32(ego.targets_in_view) / wp.float32(wp.max(ego.possible_targets, 1)),  # visibility
-    )
+    values = RewardValues()
+    values[RewardPlace.progress] = truth.progress
+    values[RewardPlace.arrival] = wp.float32(ego.arrived)
+    values[RewardPlace.collision] = wp.where(ego.outcome == COLLIDED, -1.0, 0.0)
+    values[RewardPlace.off_route] = wp.where(ego.outcome == OFF_ROUTE, -1.0, 0.0)
+    values[RewardPlace.control] = -ego.effort
+    values[RewardPlace.time] = -ego.elapsed
+    values[RewardPlace.radio] = -0.001 * wp.float32(ego.bytes_sent)
+    values[RewardPlace.position_error] = -truth.position_error
+    values[RewardPlace.orientation_error] = -(truth.orientation_error / DEGREES)
+    values[RewardPlace.position_uncertainty] = per_metre(ego, ego.position_std - threshold, cap)
+    values[RewardPlace.position_error_per_metre] = per_metre(ego, truth.position_error - threshold, cap)
+    values[RewardPlace.information_gain] = ego.information_gained
+    values[RewardPlace.uncertainty] = -ego.log_determinant / 6.0
+    values[RewardPlace.observability] = log10(wp.max(ego.gramian_min_eigenvalue, EIGENVALUE_FLOOR))
+    values[RewardPlace.observability_shortfall] = per_metre(ego, shortfall, largest_shortfall)
+    values[RewardPlace.visibility] = wp.float32(ego.targets_in_view) / wp.float32(wp.max(ego.possible_targets, 1))
+    return values
 
 
 @wp.func

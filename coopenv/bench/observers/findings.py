@@ -12,7 +12,7 @@ from coopenv.estimation.metrics import position_std
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Factory
 from coopenv.observers.correction import LARGEST
-from coopenv.observers.recording import PER_TICK, Recording
+from coopenv.observers.recording import Recording
 from coopenv.observers.registry import find
 from coopenv.observers.runner import Run, run
 from coopenv.observers.sensed import Truth
@@ -84,8 +84,8 @@ def _start(recording: Recording) -> Recording:
     return replace(
         recording,
         truth=Truth(recording.truth.rotation[early], recording.truth.position[early]),
-        pan=None if recording.pan is None else recording.pan[early],
-        **{name: getattr(recording, name)[early] for name in (*PER_TICK, "due")},
+        due=recording.due[early],
+        **{name: values[early] for name, values in recording.per_tick().items()},
     )
 
 

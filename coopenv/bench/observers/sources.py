@@ -227,7 +227,7 @@ class Bags(RecordSource):
         key = pickle.dumps((self.path, self.topics, self.overrides, self.selection, times))
         if key not in _opened:
             _opened.clear()
-            _opened[key] = open_backend(self.path, None, self.overrides, topics=self.topics, selection=self.selection)
+            _opened[key] = open_backend(self.path, None, self.overrides, self.selection, topics=self.topics)
         return _opened[key]
 
 

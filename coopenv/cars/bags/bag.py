@@ -210,7 +210,7 @@ class Bag(TickGenerator):
                 assembler.put(samples[following])
                 following += 1
             tick = assembler.begin(now) if k == 0 else assembler.tick(k, now)
-            missing = np.zeros(len(tick.visible), bool) if tick.missing is None else tick.missing
+            missing = tick.filled("missing")
             yield replace(tick, missing=missing & ~tick.visible.any(axis=1))
 
 
