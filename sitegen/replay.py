@@ -15,10 +15,10 @@ import numpy as np
 
 import coopenv
 from coopenv.api.engine import Engine
+from coopenv.episode import Episode, Origin, semi_axes
 from coopenv.estimation import Sight
 from coopenv.observers.registry import states_covariance
 from coopenv.runs.scenes import scene_of
-from coopenv.viz.scene import Origin, SceneRecord, semi_axes
 from coopenv.viz.stage import Stage, roads, ways
 from coopenv.viz.style import vehicle_colour
 from sitegen.mirror import ROOT
@@ -34,7 +34,7 @@ STEP = 0.01
 _SHORTEST = 0.065  # of the scene's side, length of a vehicle as drawn
 
 
-def record_of(observer: str, broken: int | None, length: float = LENGTH) -> SceneRecord:
+def record_of(observer: str, broken: int | None, length: float = LENGTH) -> Episode:
     """Return the scene under an observer, s long."""
     blind = {} if broken is None else {f"vehicles.{broken}.camera.miss_probability": 1.0}
     scenario = coopenv.load_scenario(ENVIRONMENT, {"observer.name": observer, "horizon": length, **blind})
@@ -42,19 +42,19 @@ def record_of(observer: str, broken: int | None, length: float = LENGTH) -> Scen
         return scene_of(engine, Origin.of(ENVIRONMENT, scenario, seed=SEED))
 
 
-def variant(record: SceneRecord) -> dict[str, Any]:
+def variant(record: Episode) -> dict[str, Any]:
     """Return what an observer estimates: place, heading, 3-sigma ellipse (K, N, 6), and targets in sight (K, N)."""
-    fields, turn = record.fields, ways(record.scenario)
-    semi, axes = semi_axes(fields["position_covariance"][..., :2, :2])
+    turn = ways(record.scenario)
+    semi, axes = semi_axes(record["position_covariance"][..., :2, :2])
     semi[~np.isfinite(semi) | (not states_covariance(record.source.observer))] = 0.0
-    heading = _yaw(fields["estimate_rotation"]) + turn
+    heading = _yaw(record["rotation_estimate"]) + turn
     along = np.arctan2(axes[..., 1, 1], axes[..., 0, 1])
-    numbers = [*np.moveaxis(fields["estimate_position"][..., :2], -1, 0), heading, semi[..., 1], semi[..., 0], along]
-    visible = fields["sight"] == Sight.VISIBLE
+    numbers = [*np.moveaxis(record["position_estimate"][..., :2], -1, 0), heading, semi[..., 1], semi[..., 0], along]
+    visible = record["sight"] == Sight.VISIBLE
     return {
         "estimate": packed(np.stack(numbers, axis=-1)),
         "sight": packed(STEP * (visible @ (1 << np.arange(visible.shape[-1])))),
-        "lost": packed(STEP * (fields["position_error"] > Stage(record.scenario).bodies()[0][:, 0])),
+        "lost": packed(STEP * (record["position_error"] > Stage(record.scenario).bodies()[0][:, 0])),
     }
 
 
@@ -68,16 +68,16 @@ def packed(values: np.ndarray) -> str:
     return base64.b64encode(whole.astype("<i2").tobytes()).decode()
 
 
-def content(records: Iterable[tuple[str, int | None, SceneRecord]]) -> dict[str, Any]:
+def content(records: Iterable[tuple[str, int | None, Episode]]) -> dict[str, Any]:
     """Return what the page draws of records by observer and broken camera, all of the same motion."""
     variants, first = {}, None
     for observer, broken, record in records:
         variants[f"{observer}/{-1 if broken is None else broken}"] = variant(record)
         first = first or record
     assert first is not None
-    stage, scenario, fields = Stage(first.scenario), first.scenario, first.fields
-    L, place = stage.landmarks, fields["position"]
-    heading = _yaw(fields["rotation"][:, L:]) + ways(scenario)
+    stage, scenario = Stage(first.scenario), first.scenario
+    L, place = stage.landmarks, first["target_position"]
+    heading = _yaw(first["target_rotation"][:, L:]) + ways(scenario)
     size, center = stage.bodies(_SHORTEST * stage.side)
     return {
         "rate": (len(first) - 1) / first.length,
@@ -100,7 +100,7 @@ def main(file: Path = FILE) -> None:
     records = [(observer, broken, record_of(observer, broken)) for observer in OBSERVERS for broken in BROKEN]
     file.write_text(f"window.coopenvReplay={json.dumps(content(records), separators=(',', ':'))}\n", encoding="utf-8")
     for observer, broken, record in records:
-        print(observer, broken, (record.fields["position_error"][-1]).round(2))
+        print(observer, broken, (record["position_error"][-1]).round(2))
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ ROOMS = (
     ("world",),
     ("observers",),
     ("sources", "backends"),
+    ("episode",),
     ("viz",),
     ("policies.base",),
     ("api",),

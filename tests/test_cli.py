@@ -27,7 +27,7 @@ from coopenv.sources.mcap import write_recording
 from tests.helpers.commands import refused
 from tests.helpers.env_suite import ALIKE, each_slow
 
-FILES = {"metrics.json", "trajectory.npz", "scene.npz", "record.zip"}
+FILES = {"metrics.json", "trajectory.npz", "scene.npz"}
 FIGURES = {"errors.png", "trajectories_2d.png", "trajectories_3d.png"}
 FIGURES |= {"topology.png", "consistency.png", "observability.png"}
 
@@ -170,9 +170,7 @@ def test_run_as_json_prints_nothing_else(capsys: pytest.CaptureFixture[str], tmp
     captured = capsys.readouterr()
     printed = json.loads(captured.out)
     assert "the policy has no effect" in captured.err
-    assert printed["files"] == [
-        f"out/overtaking/{name}" for name in ("metrics.json", "trajectory.npz", "scene.npz", "record.zip")
-    ]
+    assert printed["files"] == [f"out/overtaking/{name}" for name in ("metrics.json", "trajectory.npz", "scene.npz")]
     folder = tmp_path / "out" / "overtaking"
     assert {path.name for path in folder.iterdir()} == FILES
     assert json.loads((folder / "metrics.json").read_text()) == {k: v for k, v in printed.items() if k != "files"}
@@ -282,7 +280,7 @@ def test_vehicles_without_true_poses_do_not_hide_the_errors_of_others() -> None:
     assert other["vehicle"] == "vehicle_2" and np.isnan(other["position_std_m"])  # P of this observer is a gain
 
 
-@pytest.mark.parametrize("name", ["record.zip", "replay.html", "errors.png", "video.gif"])
+@pytest.mark.parametrize("name", ["trajectory.npz", "replay.html", "errors.png", "video.gif"])
 def test_results_that_cannot_be_written_are_found_before_the_run(
     name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

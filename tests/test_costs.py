@@ -9,12 +9,9 @@ from __future__ import annotations
 import re
 import sys
 import tracemalloc
-import zipfile
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
-from hashlib import sha256
-from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,7 +29,6 @@ from coopenv.mrclam.dataset import load_dataset
 from coopenv.observers import Recording
 from coopenv.observers.contract import SensorNoise
 from coopenv.policies.loader import read_card
-from coopenv.runs.bundle import Bundle, Manifest, RunEnd
 from coopenv.sources.mcap import read_recording, write_recording
 from coopenv.sumo import files as sumo_files
 from coopenv.training.settings import read_settings
@@ -153,22 +149,6 @@ def card(n: int, folder: Path) -> Work:
 def settings(n: int, folder: Path) -> Work:
     path = file(folder, "[scenario]\n" + "".join(f'"vehicles.{i}.x" = 1\n' for i in range(n)))
     return lambda: read_settings(path)
-
-
-def bundle(n: int, folder: Path) -> Work:
-    path, buffer = folder / "run.zip", BytesIO()
-    np.savez(buffer, actions=np.zeros((n, 2, 2)))
-    parts = {"arrays.npz": buffer.getvalue(), "scenario.json": b"{}"}
-    digests = {name: sha256(content).hexdigest() for name, content in parts.items()}
-    end = RunEnd(tick=1, error="", figures={})
-    words = dict.fromkeys(("environment", "policy", "observer", "dtype", "device"), "x")
-    made = Manifest(seed=0, ticks_planned=1, versions={}, kernels={}, state_tick=0, end=end, parts=digests, **words)
-    parts["manifest.json"] = made.model_dump_json().encode()
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.comment = sha256(parts["manifest.json"]).hexdigest().encode()
-        for name, content in parts.items():
-            archive.writestr(name, content)
-    return lambda: Bundle.read(path)
 
 
 def recording(n: int) -> Recording:
@@ -330,7 +310,6 @@ ROWS = (
     Row("card of an agent", "entries", 1, card, 50),
     Row("settings of a training", "keys", 1, settings, 50),
     Row("saved state", "worlds", 1, state, 10),
-    Row("run as one file", "decisions", 1, bundle, 4000),
     Row("arrays in a file", "bytes", 1, arrays, 1000),
     Row("recording of arrays", "ticks", 1, lambda n, folder: lambda: recording(n), 50),
     Row("recording in MCAP", "ticks", 1, log, 15),

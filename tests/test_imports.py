@@ -108,7 +108,6 @@ WRONG = {
     "train facade --set nosuch=3": set(),
     "train facade --agent nosuch": set(),
     "run nosuch.mcap": {"numpy"},
-    "bundle nosuch": {"numpy"},
     "export nosuch": {"numpy"},
     "calibrate nosuch": {"numpy"},
     "svea run nosuch.toml": {"numpy"},

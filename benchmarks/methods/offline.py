@@ -18,7 +18,7 @@ from torchrl.objectives import SoftUpdate, TD3BCLoss
 from coopenv.api.registration import registered_spec
 from coopenv.base.sections import Section
 from coopenv.policies import Policy, load_agent, restart
-from coopenv.runs.recorder import DrivenEpisode, dataset_place, drive_vehicles, write_dataset
+from coopenv.runs.exports import DrivenEpisode, dataset_place, drive_vehicles, write_dataset
 from coopenv.sources.sources import open_simulation
 
 WORLDS = 32

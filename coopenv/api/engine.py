@@ -22,11 +22,11 @@ from coopenv.api.terms.results import MEMORY, results_struct, results_table, ste
 from coopenv.base.errors import CoopenvError, check_memory, error_text
 from coopenv.base.installation import load_reference
 from coopenv.base.seeds import training_seed, world_keys
+from coopenv.episode import Frame
 from coopenv.scenario import Scenario
 from coopenv.sources.base import Backend
 from coopenv.sources.sources import simulation_of
 from coopenv.sources.tick_world import open_world
-from coopenv.viz.scene import Frame
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
 from coopenv.world.model import device_memory

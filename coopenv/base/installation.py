@@ -14,7 +14,7 @@ from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from functools import cache
 from hashlib import sha256
 from importlib import import_module, metadata
-from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from shutil import copyfile, copytree, ignore_patterns
@@ -27,7 +27,7 @@ from coopenv.base.errors import CoopenvError, UnknownEnvironmentError, error_tex
 SCENES = ("lane", "roots", "tree", "random", "ring", "road", "crossroad")
 """Kinds of parametric scenes, `lane:20`; see `coopenv.scenario.scenes`."""
 
-EXPECTED = "expected a scenario (.toml), run (.zip), log (.mcap) or ROS bag (.bag, .db3, a folder with metadata.yaml)"
+EXPECTED = "expected a scenario (.toml), log (.mcap) or ROS bag (.bag, .db3, a folder with metadata.yaml)"
 BAGS = (".db3", ".bag")  # suffixes of ROS bags, which are taken for log files by mistake
 
 
@@ -147,8 +147,6 @@ def scenario_path(name_or_path: str | Path) -> Path:
         found = f"{path}: a ROS bag is no scenario; it runs with a map of its topics: coopenv run BAG --map topics.toml"
     elif path.is_dir():
         found = f"{short}: a folder; {EXPECTED}; coopenv view opens that of a run"
-    elif there and path.suffix == ".zip":
-        found = f"{short}: a run as one file, which alone `coopenv run` plays again"
     elif not there and os.path.exists(path):  # noqa: PTH110 (never raises)
         found = f"{short}: neither a file nor a folder; {EXPECTED}"
     elif not there:
@@ -306,36 +304,6 @@ def load_reference(reference: str) -> Any:
         known = [known for known in vars(module) if not known.startswith("_")]
         raise CoopenvError(f"'{reference}': no '{name}' in {place}{suggest(name, known)}")
     return getattr(module, name)
-
-
-class _Vouched:
-    """Finds modules of a folder only if they have these digests, of `code/NAME.py`; elsewhere all is as usual."""
-
-    def __init__(self, folder: Path, digests: Mapping[str, str]) -> None:
-        self._folder, self._digests = str(folder.absolute()), digests
-
-    def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        """Return the module of a name, None if it is not in the folder. Raises ImportError: it is not vouched for."""
-        if path is not None or (found := PathFinder.find_spec(name, [self._folder])) is None:
-            return None  # a part of a package that has been found, or not in the folder
-        if found.origin is None:  # a folder, which any other module of this name precedes
-            found = PathFinder.find_spec(name) or found
-            if found.origin is not None:
-                return None
-        elif file_digest(Path(found.origin)) == self._digests.get(f"code/{name}.py"):
-            return spec_from_file_location(name, found.origin, loader=_FromSource(name, found.origin))
-        raise ImportError(f"{name} of the current folder: no digest of it is stated")
-
-
-@contextmanager
-def importing_vouched(folder: Path, digests: Mapping[str, str]) -> Iterator[None]:
-    """Import from a folder only files with these digests (SHA-256), by the name `code/FILE.py`."""
-    finder: Any = _Vouched(folder, digests)
-    sys.meta_path.insert(0, finder)
-    try:
-        yield
-    finally:
-        sys.meta_path.remove(finder)
 
 
 def file_digest(path: Path) -> str:

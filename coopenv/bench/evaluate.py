@@ -22,6 +22,7 @@ from coopenv.base.format import json_text
 from coopenv.base.installation import names_of, version, versions
 from coopenv.bench.contest import Contest
 from coopenv.bench.evaluation import KINDS, Evaluation, evaluated
+from coopenv.episode import Episode, Origin
 from coopenv.evaluation import METRICS, held_out_seeds
 from coopenv.evaluation.episodes import Episodes
 from coopenv.evaluation.metrics import SCORE, Quantile, interval, resamples
@@ -33,7 +34,6 @@ from coopenv.runs.films import Shot, video_path
 from coopenv.runs.scenes import frame_stride, scene_of, write_page
 from coopenv.scenario import ScenarioLike
 from coopenv.viz import FORMATS, style
-from coopenv.viz.scene import Origin, SceneRecord
 from coopenv.viz.style import INK, NORMAL, SMALL
 from coopenv.viz.topview import TopView
 
@@ -258,7 +258,7 @@ COLUMNS = 3
 """Pictures in a row of the film."""
 
 
-def scenes_of(evaluation: Evaluation, log: Console) -> list[SceneRecord]:
+def scenes_of(evaluation: Evaluation, log: Console) -> list[Episode]:
     """Return every driver's episode in the first world of an evaluation."""
     seed, scenes = held_out_seeds(evaluation.block, evaluation.worlds)[0], []
     for entrant in evaluation.entrants:
@@ -268,7 +268,7 @@ def scenes_of(evaluation: Evaluation, log: Console) -> list[SceneRecord]:
     return scenes
 
 
-def write_film(scenes: Sequence[SceneRecord], folder: Path, log: Console) -> None:
+def write_film(scenes: Sequence[Episode], folder: Path, log: Console) -> None:
     """Write the film of all drivers, side by side and below each other, until the last episode has ended."""
     shots = [Shot(record, TopView(record.scenario, panel=False), record.source.policy) for record in scenes]
     rows = [shots[first : first + COLUMNS] for first in range(0, len(shots), COLUMNS)]
@@ -278,7 +278,7 @@ def write_film(scenes: Sequence[SceneRecord], folder: Path, log: Console) -> Non
         films.write_film(rows, path, fps, width=None, on_progress=progress.update)
 
 
-def write_replays(evaluation: Evaluation, scenes: Sequence[SceneRecord], folder: Path, log: Console) -> None:
+def write_replays(evaluation: Evaluation, scenes: Sequence[Episode], folder: Path, log: Console) -> None:
     """Write a page per driver; none, and a line, where the extra `view` is missing.
 
     `replay.html` is that of the first driver that has learnt, else of the first of all.

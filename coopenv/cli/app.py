@@ -22,7 +22,7 @@ from coopenv.base.installation import version as installed_version
 from coopenv.cli import commands, options
 from coopenv.cli.bench import bench, bench_observers
 from coopenv.cli.plugins import Extended
-from coopenv.cli.run import bundle, export, figures, record, run
+from coopenv.cli.run import export, figures, record, run
 from coopenv.cli.train import dataset, evaluate, train
 from coopenv.cli.view import film, play, view, watch
 
@@ -142,7 +142,6 @@ app.command(rich_help_panel=RUN)(run)
 app.command(rich_help_panel=RUN)(record)
 app.command(rich_help_panel=RUN)(export)
 app.command(rich_help_panel=RUN)(figures)
-app.command(rich_help_panel=RUN)(bundle)
 app.add_typer(bench, name="bench", rich_help_panel=COMPARE)
 app.command("compare", hidden=True)(bench_observers)  # its name in Python
 app.command(rich_help_panel=COMPARE)(evaluate)

@@ -1,21 +1,17 @@
-"""`coopenv run`, `record`, `bundle`, `figures` and `export`."""
+"""`coopenv run`, `record`, `figures` and `export`."""
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from coopenv.base.errors import CoopenvError, DataWarning
 from coopenv.cli import arguments, commands, options
-
-if TYPE_CHECKING:
-    from coopenv.api.engine import Engine
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,15 +46,7 @@ class RunOptions(options.SourceOptions):
 
 @commands.command
 def run(given: RunOptions) -> None:
-    """Run an environment; write metrics, arrays, figures and a page that plays the episode.
-
-    The file of an earlier run, which `coopenv bundle` wrote, runs again and is compared.
-    """
-    if given.environment.endswith(BUNDLE):
-        others = {field.name for field in fields(given)} - {"environment", "as_json"}
-        commands.refuse(given, others, f"is for a new run, {given.environment} is replayed as it was")
-        replay(Path(given.environment), given.as_json)
-        return
+    """Run an environment; write metrics, arrays, figures and a page that plays the episode."""
     name = Path(given.environment).stem
     refuse_for_recordings(given.environment, seed=given.seed, policy=given.policy)
     backend = given.open()
@@ -89,52 +77,10 @@ def run(given: RunOptions) -> None:
         options.show_page(page) if page in result.files else options.show(folder)
 
 
-BUNDLE = ".zip"
-
-
-def replay(path: Path, as_json: bool = False) -> None:
-    """Run a bundle again. Raises CoopenvError: it is not valid, or something else comes out."""
-    from coopenv.runs.bundle import Bundle
-
-    bundle, printed = Bundle.read(path), options.console()
-    if others := bundle.other_versions():
-        options.console(stderr=True).print(f"note: made with {', '.join(others)}", soft_wrap=True)
-    if differing := bundle.replay():
-        raise CoopenvError(f"{path}: the result differs from the file's: {'; '.join(differing)}")
-    if as_json:
-        options.print_json(bundle.manifest.model_dump(include={"environment", "seed", "policy", "observer", "end"}))
-        return
-    printed.print(f"{path}: {bundle.title}", soft_wrap=True)
-    end = bundle.manifest.end
-    same = "The same figures up to the driver's error" if end.by_driver else "The same error"
-    printed.print(f"{same}: {end.error}" if end.error else "The same figures.", soft_wrap=True)
-
-
 RunFolder = Annotated[
     Path,
     typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.", callback=arguments.existing("run")),
 ]
-
-
-def bundle(
-    run: RunFolder,
-    out: Annotated[Path | None, typer.Option(help="File to write (default: RUN.zip).")] = None,
-) -> None:
-    """Write a run, or one that failed, to one file, which `coopenv run` replays."""
-    from shutil import copyfile
-
-    from coopenv.base.files import replacing_file
-    from coopenv.runs.bundle import RECORD_FILE, Bundle
-
-    if run.is_dir() and not (run / RECORD_FILE).is_file():
-        raise CoopenvError(f"{run}: holds no {RECORD_FILE}, as only simulated runs do; send the recording instead")
-    found = Bundle.read(run / RECORD_FILE)
-    file = out or run.with_name(f"{run.name}{BUNDLE}")
-    with replacing_file(file) as new:
-        copyfile(found.path, new)
-    options.console().print(
-        f"{file}: {found.title}. It runs again with: coopenv run {quote(str(file))}", soft_wrap=True
-    )
 
 
 def refuse_for_recordings(environment: str, seed: int, policy: str) -> None:
@@ -172,14 +118,13 @@ def record(given: RecordOptions) -> None:
     from coopenv.base.files import check_new
     from coopenv.observers.registry import with_observer
     from coopenv.runs.console import Progress
-    from coopenv.runs.recorder import record as recorded
+    from coopenv.runs.recorder import record_episode
     from coopenv.runs.scenes import (
         MOST_SHOWN,
-        Keeper,
+        frame_stride,
         observer_of,
         pages_can_be_written,
         played_scene,
-        source_of,
         title_of,
         write_log,
         write_page,
@@ -195,13 +140,7 @@ def record(given: RecordOptions) -> None:
     if given.topics is not None and "topics" not in kind.options:
         raise CoopenvError(f"--map {given.topics}: is for ROS bags, {environment} is none")
     refuse_for_recordings(environment, given.seed, given.policy)
-    log, keepers = options.console(stderr=True), list[Keeper]()
-
-    def keep(engine: Engine, tick: int) -> None:
-        if not keepers:
-            keepers.append(Keeper(engine, source_of(engine, out.name, given.seed, given.policy)))
-        keepers[0].tick(tick)
-
+    log, played = options.console(stderr=True), None
     if kind.reader:
         if given.changes:
             raise CoopenvError(f"--override: is for a simulation, {environment} is recorded")
@@ -209,16 +148,15 @@ def record(given: RecordOptions) -> None:
     else:
         backend = given.open()
         with Progress(log, "recording", total=1.0) as progress:
-            recording = recorded(backend, given.seed, given.policy, progress.update, keep)
+            episode = record_episode(backend, given.seed, given.policy, progress.update, name=out.name)
+        recording, played = episode.measured, episode.drawn(frame_stride(episode.scenario))
     write_log(recording, out, log, observer, given.scene)
     count = len(recording.setups)
     facts = f"{count} vehicle{'' if count == 1 else 's'}, {recording.ticks} ticks, {recording.t[-1]:g} s"
     options.console().print(f"{out}: {facts}", soft_wrap=True)
     if given.no_replay or not pages_can_be_written(page, log):
         return
-    if keepers:
-        played = keepers[0].record()
-    else:
+    if played is None:
         with warnings.catch_warnings(action="ignore", category=DataWarning):  # these have been printed
             shown = observer or observer_of(recording)
             backend = open_backend(environment, None, with_observer({}, shown), given.selection, **given.files)
@@ -297,7 +235,7 @@ def export(
         _export_layout(source, out or Path(LAYOUT_FILE))
         return
     from coopenv.runs.command import Results
-    from coopenv.runs.recorder import write_tum
+    from coopenv.runs.exports import write_tum
 
     results = Results.read(source)
     if file_format in (ExportFormat.csv, ExportFormat.parquet):

@@ -280,7 +280,7 @@ def dataset(given: DatasetOptions) -> None:
     from coopenv.api.registration import registered_spec
     from coopenv.policies import load_policy
     from coopenv.runs.console import Progress, compile_notice
-    from coopenv.runs.recorder import dataset_place, drive_vehicles, write_dataset
+    from coopenv.runs.exports import dataset_place, drive_vehicles, write_dataset
 
     driver = load_policy(policy, scenario, given.seed)
     own = Path(policy.rpartition(":")[2] or policy).name

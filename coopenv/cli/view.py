@@ -13,12 +13,12 @@ from coopenv.cli import arguments, commands, options
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from coopenv.episode import Episode
     from coopenv.policies import Policy
     from coopenv.runs.films import Shot
     from coopenv.runs.live import Reel
     from coopenv.scenario import Scenario
     from coopenv.sources.base import Backend
-    from coopenv.viz.scene import SceneRecord
 
 Agent = Annotated[
     str | None,
@@ -73,7 +73,7 @@ class SceneOptions(options.SourceOptions):
 
         return driver_of(self.agent, scenario, self.environment, self.seed, LOOKING)
 
-    def saved(self) -> "SceneRecord | None":
+    def saved(self) -> "Episode | None":
         """Return the scene of an earlier run; None: the source is no such run.
 
         Raises:
@@ -134,7 +134,7 @@ class FilmOptions(SceneOptions):
         str | None, typer.Option(help="Headings of films side by side, with commas between (default: their names).")
     ] = None
 
-    def takes(self, log: "Console") -> "list[tuple[str, SceneRecord]]":
+    def takes(self, log: "Console") -> "list[tuple[str, Episode]]":
         """Return the scenes that stand side by side, each with what it differs in.
 
         Raises:
@@ -157,14 +157,14 @@ class FilmOptions(SceneOptions):
             for name, (observer, agent) in zip(headings or names, pairs, strict=True)
         ]
 
-    def _played(self, log: "Console") -> "SceneRecord":
+    def _played(self, log: "Console") -> "Episode":
         from coopenv.runs.scenes import played_scene, title_of
 
         backend = self.open()
         policy, driver = (None, "") if backend.capabilities.recorded else self.driver(backend.scenario)
         return played_scene(backend, title_of(self.environment), log, self.seed, policy, driver)
 
-    def shots(self, takes: "list[tuple[str, SceneRecord]]") -> "list[list[Shot]]":
+    def shots(self, takes: "list[tuple[str, Episode]]") -> "list[list[Shot]]":
         """Return the parts of the picture: a column for each scene, a row for each camera.
 
         Raises:

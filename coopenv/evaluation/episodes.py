@@ -1,6 +1,6 @@
 """Episodes in every world of a batch: stepping, and the records that drivers are judged by."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.base.seeds import evaluation_seed, world_keys
+from coopenv.episode import Views
 from coopenv.estimation import Outcome, Sight
 from coopenv.policies import Policy, decide, restart
 from coopenv.scenario import Scenario
@@ -20,7 +21,10 @@ DIVERGED = 1e9  # m or deg: stands for an error that is not a number
 
 @dataclass(frozen=True)
 class Episodes:
-    """Record of the driven vehicles; K decisions, W worlds, N driven vehicles. Row k is the end of decision k."""
+    """Record of the driven vehicles in many worlds, for the score of a driver, which has no single `Episode`.
+
+    K decisions, W worlds, N driven vehicles. Row k is the end of decision k.
+    """
 
     vehicles: tuple[str, ...]
     """(N,) names."""
@@ -192,25 +196,6 @@ def estimated_here(engine: Engine) -> tuple[int, ...]:
     """Return flags of the vehicles that are estimated here, not elsewhere and received by radio."""
     here = engine.backend.capabilities.estimated
     return tuple(range(engine.world.model.vehicles)) if here is None else here
-
-
-class Views:
-    """Fields of an engine at several ticks; one whose copying was interrupted does not count."""
-
-    def __init__(self, engine: Engine, names: Iterable[str]) -> None:
-        self._engine = engine
-        self._rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
-        self.taken = 0
-
-    def take(self) -> None:
-        """Copy the fields as they are now."""
-        for name, rows in self._rows.items():
-            rows.append(self._engine.view(name).copy())
-        self.taken += 1
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        """Return (K, W, ...) of one field."""
-        return np.stack(self._rows[name][: self.taken])
 
 
 def drive(

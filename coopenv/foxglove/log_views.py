@@ -13,8 +13,7 @@ from coopenv.base.installation import install_command, needing
 from coopenv.viz.style import vehicle_colour
 
 if TYPE_CHECKING:
-    from coopenv.observers import Run
-    from coopenv.observers.recording import Recording
+    from coopenv.episode import Episode
     from coopenv.sources.mcap_format import View
 
 
@@ -28,23 +27,21 @@ def check_installed() -> None:
         import foxglove.messages  # noqa: F401
 
 
-def views(recording: Recording, run: Run, *, start: float = 0.0, gain: bool = False) -> list[View]:
+def views(episode: Episode, *, start: float = 0.0) -> list[View]:
     """Return the topics that Foxglove and Lichtblick show, to give to `write_recording`.
 
     Args:
-        recording: what the vehicles sense.
-        run: of an observer on that recording, whose estimates are shown.
+        episode: with the recording of its measurements.
         start: s since 1970, when tick 0 was.
-        gain: whether the observer's P is a gain matrix, so that it is not shown as a covariance.
 
     Raises:
-        CoopenvError: Foxglove's SDK is not installed.
+        CoopenvError: Foxglove's SDK is not installed, or the episode has no recording.
     """
     check_installed()
-    from coopenv.foxglove.messages import RunView, topics
+    from coopenv.foxglove.messages import LogView, topics
     from coopenv.sources.mcap_format import LogClock
 
-    return topics(RunView(recording, run, LogClock(recording.dt, start), gain))
+    return topics(LogView(episode, LogClock(episode.measured.dt, start)))
 
 
 _PLOTS = {

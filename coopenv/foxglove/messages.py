@@ -1,4 +1,4 @@
-"""Messages of the topics that Foxglove shows, made from the frames of a recorded drive.
+"""Messages of the topics that Foxglove shows, made of an episode with its recording.
 
 Vehicles are boxes in frames of their own, which the transforms move. A vehicle without any known truth is shown at its
 estimate alone.
@@ -16,13 +16,11 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.format import jsonable
-from coopenv.estimation.poses import Array, covariance_in_map
-from coopenv.observers import Run
-from coopenv.observers.recording import Recording
+from coopenv.episode import Episode, semi_axes
+from coopenv.estimation.poses import Array, Coordinates, covariance_in_map
 from coopenv.scenario.bodies import Body
 from coopenv.sources.mcap_format import LogClock, View, codec, ros_definition
 from coopenv.viz.perspective import pixels
-from coopenv.viz.scene import semi_axes
 from coopenv.viz.stage import Stage, roads, ways
 from coopenv.viz.style import DARK_BLUE, INK, vehicle_colour
 from coopenv.viz.topview_ground import ASPHALT, ROOF
@@ -59,24 +57,27 @@ _ERROR_SCHEMA = json.dumps(
 ).encode()
 
 
-class RunView:
-    """A recording and a run of an observer on it.
+class LogView:
+    """An episode with its recording, as a log shows it.
 
     A vehicle whose truth is never known has the pose of its estimate.
     """
 
-    def __init__(self, recording: Recording, run: Run, clock: LogClock, gain: bool) -> None:
-        """Set the source; with `gain` the observer's P is a gain matrix, and no covariance."""
-        r, self.recording, self.run, self.clock, self.gain = recording, recording, run, clock, gain
+    def __init__(self, episode: Episode, clock: LogClock) -> None:
+        """Set the source. Raises CoopenvError: the episode has no recording."""
+        r = self.recording = episode.measured
+        self.clock, self.gain = clock, not episode.source.honest
+        e = self.estimates = episode.trajectory
         self.ticks = range(0, r.ticks, max(1, round(1.0 / (_RATE * r.dt))))
         """Ticks to show, at most 20 a second."""
         self.names = [setup.name for setup in r.setups]
         known = np.atleast_1d(r.truth.known.any(axis=0))
         self.bodies = [(name if known[i] else f"{name}/estimate", i) for i, name in enumerate(self.names)]
         """Frame and index of the true body of each vehicle with a known truth, else of its estimate."""
-        self.rotation = np.where(known[:, None, None], r.truth.rotation, run.rotation)
-        self.position = np.where(known[:, None], r.truth.position, run.position)
-        self.covariance = covariance_in_map(run.coordinates, run.rotation, run.position, run.covariance)
+        self.rotation = np.where(known[:, None, None], r.truth.rotation, e.rotation_estimate)
+        self.position = np.where(known[:, None], r.truth.position, e.position_estimate)
+        pose = e.rotation_estimate, e.position_estimate
+        self.covariance = covariance_in_map(Coordinates.RICCATI, *pose, e.covariance)
         """(K, N, 6, 6) of position and rotation in the map."""
         self.semi, self.axes = semi_axes(self.covariance[..., :3, :3])
         """(K, N, 3) and (K, N, 3, 3) of ellipsoids of 3 sigma."""
@@ -97,8 +98,8 @@ class RunView:
         return fox.Timestamp(sec=seconds, nsec=nanoseconds)
 
 
-def topics(view: RunView) -> list[View]:
-    """Return all topics that are shown of a recording and a run."""
+def topics(view: LogView) -> list[View]:
+    """Return all topics that are shown of an episode."""
     found = []
 
     def add(topic: str, kind: Any, message: Callable[..., Any], *given: Any, once: bool = False) -> None:
@@ -127,7 +128,7 @@ def topics(view: RunView) -> list[View]:
     return found
 
 
-def _world(view: RunView, k: int) -> Any:
+def _world(view: LogView, k: int) -> Any:
     """Return the static scene."""
     scenario, entities = view.recording.scenario, []
     if scenario is not None:
@@ -143,19 +144,19 @@ def _world(view: RunView, k: int) -> Any:
     return fox.SceneUpdate(entities=entities + [_landmark(view, k, i) for i in still])
 
 
-def _moving(view: RunView, k: int) -> Any:
+def _moving(view: LogView, k: int) -> Any:
     """Return the landmarks that move."""
     return fox.SceneUpdate(entities=[_landmark(view, k, i) for i in view.moving_landmarks])
 
 
-def _landmark(view: RunView, k: int, i: int) -> Any:
+def _landmark(view: LogView, k: int, i: int) -> Any:
     place, name = view.recording.landmarks[k, i], view.recording.setups[0].target_names[i]
     ball = _ball(place, _UPRIGHT, [_BALL * view.extent] * 3, _colour(DARK_BLUE))
     above = _text(view, name, np.add(place, (0.0, 0.0, 0.8 * _LETTERS * view.extent)))
     return _entity(view, k, f"landmark {name}", spheres=[ball], texts=[above])
 
 
-def _vehicles(view: RunView, k: int) -> Any:
+def _vehicles(view: LogView, k: int) -> Any:
     """Return the vehicles: the true ones opaque and with names, the estimated ones translucent."""
     scenario = view.recording.scenario
     angles = np.zeros(len(view.names)) if scenario is None else ways(scenario)
@@ -174,13 +175,13 @@ def _vehicles(view: RunView, k: int) -> Any:
     return fox.SceneUpdate(entities=entities)
 
 
-def _transforms(view: RunView, k: int) -> Any:
+def _transforms(view: LogView, k: int) -> Any:
     """Return the frames of bodies, true and estimated, and of cameras."""
     found = []
     for shown, i in view.bodies:
         name, camera = view.names[i], view.cameras.get(i)
         poses = {shown: (_MAP, view.rotation[k, i], view.position[k, i])}
-        poses[f"{name}/estimate"] = _MAP, view.run.rotation[k, i], view.run.position[k, i]
+        poses[f"{name}/estimate"] = _MAP, view.estimates.rotation_estimate[k, i], view.estimates.position_estimate[k, i]
         if camera is not None and (k == 0 or view.recording.pan is not None):
             poses[f"{name}/camera"] = shown, camera.to_body(float(view.pan[k, i])), np.array(camera.position)
         for child, (parent, R, p) in poses.items():
@@ -191,7 +192,7 @@ def _transforms(view: RunView, k: int) -> Any:
     return fox.FrameTransforms(transforms=found)
 
 
-def _sight(view: RunView, k: int) -> Any:
+def _sight(view: LogView, k: int) -> Any:
     """Return lines from every camera to the targets that it measures, in the colour of the vehicle."""
     r, R, p = view.recording, view.rotation[k], view.position[k]
     lever, marker = (np.array([getattr(s, part) for s in r.setups]) for part in ("lever_arm", "marker"))
@@ -214,9 +215,9 @@ def _sight(view: RunView, k: int) -> Any:
     return fox.SceneUpdate(entities=entities)
 
 
-def _uncertainty(view: RunView, k: int) -> Any:
+def _uncertainty(view: LogView, k: int) -> Any:
     """Return ellipsoids of 3 sigma about the estimated places."""
-    entities, gone, place = [], [], view.run.position[k]
+    entities, gone, place = [], [], view.estimates.position_estimate[k]
     largest = np.where(np.isfinite(place).all(axis=-1), view.semi[k, :, -1], np.nan)
     for i, name in enumerate(view.names):
         if largest[i] < _LARGEST * view.extent:
@@ -227,13 +228,13 @@ def _uncertainty(view: RunView, k: int) -> Any:
     return fox.SceneUpdate(entities=entities, deletions=gone)
 
 
-def _poses(view: RunView, vehicle: int) -> Messages:
+def _poses(view: LogView, vehicle: int) -> Messages:
     """Yield a vehicle's estimate; a covariance of zeros, as ROS has it, where the observer states none."""
     store = codec()
     types = {name.rpartition("/")[2]: kind for name, kind in store.types.items() if "geometry_msgs" in name}
     time, header = (store.types[name] for name in ("builtin_interfaces/msg/Time", "std_msgs/msg/Header"))
     for k in view.ticks:
-        R, p = view.run.rotation[k, vehicle], view.run.position[k, vehicle]
+        R, p = view.estimates.rotation_estimate[k, vehicle], view.estimates.position_estimate[k, vehicle]
         if not (np.isfinite(R).all() and np.isfinite(p).all()):
             continue
         covariance = view.covariance[k, vehicle]
@@ -245,9 +246,9 @@ def _poses(view: RunView, vehicle: int) -> Messages:
         yield k, bytes(store.serialize_cdr(message, _POSE))
 
 
-def _errors(view: RunView, vehicle: int) -> Messages:
+def _errors(view: LogView, vehicle: int) -> Messages:
     """Yield a vehicle's errors as JSON; null where they are not known."""
-    run = view.run
+    run = view.estimates
     for k in view.ticks:
         sigma = np.nan if view.gain else view.semi[k, vehicle, -1]
         nees = run.nees[k, vehicle] if np.isfinite(sigma) else np.nan
@@ -258,7 +259,7 @@ def _errors(view: RunView, vehicle: int) -> Messages:
         yield k, json.dumps(jsonable(row), separators=(",", ":")).encode()
 
 
-def _calibration(view: RunView, k: int, vehicle: int) -> Any:
+def _calibration(view: LogView, k: int, vehicle: int) -> Any:
     """Return a camera's calibration."""
     camera = view.cameras[vehicle]
     (fx, fy), (cx, cy) = camera.focal_length, camera.principal_point
@@ -276,7 +277,7 @@ def _calibration(view: RunView, k: int, vehicle: int) -> Any:
     )
 
 
-def _image(view: RunView, k: int, vehicle: int) -> Any:
+def _image(view: LogView, k: int, vehicle: int) -> Any:
     """Return an empty image: a canvas for the annotations, as simulated cameras have no pixels."""
     file, (width, height) = BytesIO(), view.cameras[vehicle].image_size
     Image.new("RGB", (int(width), int(height)), _CANVAS).save(file, "png")
@@ -284,7 +285,7 @@ def _image(view: RunView, k: int, vehicle: int) -> Any:
     return fox.CompressedImage(timestamp=view.stamp(k), frame_id=frame, data=file.getvalue(), format="png")
 
 
-def _annotations(view: RunView, k: int, vehicle: int) -> Any:
+def _annotations(view: LogView, k: int, vehicle: int) -> Any:
     """Return circles where the measured bearings hit the image, with the names of the targets."""
     r, camera, stamp = view.recording, view.cameras[vehicle], view.stamp(k)
     targets = np.flatnonzero(r.visible[k, vehicle])
@@ -301,11 +302,11 @@ def _annotations(view: RunView, k: int, vehicle: int) -> Any:
     return fox.ImageAnnotations(circles=circles, texts=words)
 
 
-def _entity(view: RunView, k: int, name: str, frame: str = _MAP, **parts: Any) -> Any:
+def _entity(view: LogView, k: int, name: str, frame: str = _MAP, **parts: Any) -> Any:
     return fox.SceneEntity(timestamp=view.stamp(k), frame_id=frame, id=name, **parts)
 
 
-def _text(view: RunView, words: str, place: Any) -> Any:
+def _text(view: LogView, words: str, place: Any) -> Any:
     """Return words that face the viewer."""
     look = {"font_size": _LETTERS * view.extent, "color": _colour(INK), "text": words}
     return fox.TextPrimitive(pose=_pose(place), billboard=True, **look)

@@ -2,22 +2,22 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from shlex import quote
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
 
 from coopenv.base.errors import CoopenvError, DataError, explained, listed
-from coopenv.base.files import new_folder, replace_text, replacing_folder
+from coopenv.base.files import replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import install_command
 from coopenv.base.seeds import checked_seed
+from coopenv.episode import SCENE_FILE
 from coopenv.estimation.metrics import shown_note, shown_vehicles, steady_start
 from coopenv.estimation.observability import Observability, analyse_observability
 from coopenv.estimation.trajectory import Trajectory
@@ -29,17 +29,15 @@ from coopenv.report.table import Table
 from coopenv.report.tabular import Tabular
 from coopenv.report.terminal import Terminal, text_of
 from coopenv.runs import console as lines
-from coopenv.runs.bundle import RECORD_FILE, RunRecord
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.films import VIDEO_FILES, top_view_film, video_path, write_film
 from coopenv.runs.rollouts import Rollout, estimates, run_metrics, theory_rates, vehicle_metrics
-from coopenv.runs.scenes import Keeper, frame_stride, source_of, write_page
+from coopenv.runs.scenes import frame_stride, write_page
 from coopenv.scenario import Scenario, ScenarioLike, load_scenario
 from coopenv.sources.base import Repeating
 from coopenv.sources.selection import Selection
 from coopenv.sources.sources import open_backend, source_name
 from coopenv.viz import FIGURE_NAMES, FORMATS
-from coopenv.viz.scene import SCENE_FILE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,7 +50,7 @@ METRICS_FILE, TRAJECTORY_FILE, REPLAY_FILE = "metrics.json", "trajectory.npz", "
 def result_names() -> list[str]:
     """Return the names of all files that a run can write."""
     figures = [f"{name}.{file_format}" for name in FIGURE_NAMES for file_format in FORMATS]
-    return [METRICS_FILE, TRAJECTORY_FILE, SCENE_FILE, RECORD_FILE, REPLAY_FILE, *figures, *VIDEO_FILES]
+    return [METRICS_FILE, TRAJECTORY_FILE, SCENE_FILE, REPLAY_FILE, *figures, *VIDEO_FILES]
 
 
 def execute(
@@ -70,10 +68,9 @@ def execute(
 ) -> "Results":
     """Run, write to the folder `out` (None: no files), and return what came of it.
 
-    A run that does not reach its end writes nothing to `out`; that of an error leaves its record in the folder
-    `OUT_failed`, see `coopenv.runs.bundle`. `figures` is their format; None: no figures. `width` is a column
-    of `coopenv.viz.figures`; None: a page's. `describe` returns the text beside the bar. `check` is called when the
-    run is over, and raises CoopenvError if it is not worth its files.
+    A run that does not reach its end writes nothing to `out`. `figures` is their format; None: no figures. `width` is a
+    column of `coopenv.viz.figures`; None: a page's. `describe` returns the text beside the bar. `check` is called when
+    the run is over, and raises CoopenvError if it is not worth its files.
 
     Raises:
         CoopenvError: an argument is not valid, or the results cannot be written.
@@ -89,29 +86,22 @@ def execute(
     with nullcontext() if out is None else replacing_folder(out, result_names()) as folder:
         with compile_notice(log):
             run.engine.load()
-        keeper = Keeper(run.engine, source_of(run.engine, name, run.seed, run.policy_name))
-        record = None if able.recorded or able.real_time or out is None else RunRecord(run)
+        stride = frame_stride(scenario)
         with Progress(log, doing, run.ticks_planned, paced) as progress:
-            with _kept_if_failed(record, out, name, log):
-                for tick in run.play():
-                    if record is not None:
-                        record.tick(tick)
-                    if keeper.tick(tick):
-                        progress.update(tick, describe() if describe is not None else None)
+            for tick in run.play():
+                if tick % stride == 0:
+                    progress.update(tick, describe() if describe is not None else None)
             if check is not None:
                 check()
-            trajectory = run.trajectory()
-            results, observability = _figures_of(name, overrides, run, trajectory, steady)
+            episode = run.episode(name)
+            results, observability = _figures_of(name, overrides, run, episode.trajectory, steady)
         if folder is None or out is None:
             return results
-        scene = keeper.record()
+        scene = episode.drawn(stride)
         paths = [folder / METRICS_FILE, folder / TRAJECTORY_FILE, folder / SCENE_FILE]
         replace_text(paths[0], json_text(results.metrics))
-        trajectory.save(paths[1])
+        episode.trajectory.save(paths[1])
         scene.save(paths[2])
-        if record is not None:
-            paths.append(folder / RECORD_FILE)
-            record.save(paths[-1], name)
         if figures is not None and observability is not None:
             with Progress(log, "drawing figures"):
                 paths += results.save_figures(folder, figures, width, observability)
@@ -121,7 +111,7 @@ def execute(
         if video:
             paths.append(video_path(folder))
             with Progress(log, f"filming {paths[-1].name}", 1.0) as progress:
-                fps = scenario.rates.camera / frame_stride(scenario)
+                fps = scenario.rates.camera / stride
                 write_film(top_view_film(scene), paths[-1], fps, width=None, on_progress=progress.update)
             if paths[-1].suffix == ".gif":
                 log.print(f"video: written as GIF; for MP4: {install_command('video')}", soft_wrap=True)
@@ -143,20 +133,6 @@ def _figures_of(
         without = estimates(whole.of_vehicles(unknown), steady, covariance)
     metrics = run_metrics(name, overrides, run, rows, steady, without)
     return Results(metrics, known if chosen else whole.of_vehicles(unknown), run.scenario), observability
-
-
-@contextmanager
-def _kept_if_failed(record: RunRecord | None, out: Path | None, name: str, log: Console) -> Iterator[None]:
-    """Write the record of a run that fails to a folder of its own."""
-    try:
-        yield
-    except CoopenvError as error:
-        if record is not None and out is not None:
-            folder = out.with_name(f"{out.name}_failed")
-            with new_folder(folder):
-                record.save(folder / RECORD_FILE, name, error)
-            log.print(f"kept for a report: coopenv bundle {quote(str(folder))}", soft_wrap=True)
-        raise
 
 
 @partial(explained, hint="; several seeds or observers: coopenv.compare")

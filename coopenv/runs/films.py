@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import replacing_file, writing
 from coopenv.base.installation import install_command
-from coopenv.viz.scene import Frame, SceneRecord
+from coopenv.episode import Episode, Frame
 
 if TYPE_CHECKING:  # imports Matplotlib, which is only needed where there is a film
     from coopenv.viz.stage import Stage
@@ -49,7 +49,7 @@ def video_path(folder: Path) -> Path:
 class Shot(NamedTuple):
     """One part of the picture of a film."""
 
-    record: SceneRecord
+    record: Episode
     view: "TopView | View3d"
     name: str = ""
     """Stands above the picture, with driver, observer and the number of lost vehicles; empty: no heading."""
@@ -97,7 +97,7 @@ def write_film(
     return count
 
 
-def top_view_film(record: SceneRecord, panel: bool = True) -> list[list[Shot]]:
+def top_view_film(record: Episode, panel: bool = True) -> list[list[Shot]]:
     """Return the film of one scene from above; `panel`: table and legend beside the map."""
     from coopenv.viz.topview import TopView
 
@@ -105,7 +105,7 @@ def top_view_film(record: SceneRecord, panel: bool = True) -> list[list[Shot]]:
 
 
 def space_film(
-    takes: Sequence[tuple[str, SceneRecord]], width: int, cameras: Sequence[str] = ("overview",), vehicle: int = 0
+    takes: Sequence[tuple[str, Episode]], width: int, cameras: Sequence[str] = ("overview",), vehicle: int = 0
 ) -> list[list[Shot]]:
     """Return the 3-D film of scenes.
 
@@ -123,7 +123,7 @@ def space_film(
     each = width // len(takes)
     size = each, each * 9 // 16 if len(takes) == 1 else each * 3 // 4
 
-    def shot(name: str, record: SceneRecord, camera: str) -> Shot:
+    def shot(name: str, record: Episode, camera: str) -> Shot:
         return Shot(record, View3d(record.scenario, size, camera, vehicle), name)
 
     heading, *rows = cameras
@@ -170,7 +170,7 @@ def lost(stage: "Stage", frame: Frame) -> np.ndarray:
     return np.asarray(frame.position_error > stage.bodies()[0][:, 0])
 
 
-def cause_of_loss(record: SceneRecord, stage: "Stage", frame: Frame) -> str:
+def cause_of_loss(record: Episode, stage: "Stage", frame: Frame) -> str:
     """Return why vehicles are lost: the observer is wrong, or the vehicle sees too little.
 
     An error within three stated standard deviations is no mistake of the observer: the drivers kept too few targets in

@@ -11,14 +11,15 @@ from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import action_fields
 from coopenv.base.errors import CoopenvError, listed, suggest
+from coopenv.episode import Episode, Frame, Origin
 from coopenv.evaluation.episodes import play
 from coopenv.observers.registry import available_names
 from coopenv.policies import Policy, restart
 from coopenv.runs.console import compile_notice
-from coopenv.runs.scenes import MAX_FPS, frame_stride, source_of
+from coopenv.runs.recorder import source_of
+from coopenv.runs.scenes import MAX_FPS, frame_stride
 from coopenv.scenario import Scenario
 from coopenv.sources.base import Backend
-from coopenv.viz.scene import Frame, Origin, SceneRecord
 from coopenv.viz.stage import vehicle_mark
 from coopenv.viz.topview import PictureWindow, TopView
 from coopenv.viz.topview_ground import HEIGHT, WIDTH
@@ -215,7 +216,7 @@ class Reel:
         self.frames, self.abilities = list[Frame](), abilities
 
     @classmethod
-    def of(cls, record: SceneRecord) -> "Reel":
+    def of(cls, record: Episode) -> "Reel":
         """Return the frames of a scene that a run has kept."""
         return cls(record.scenario, record.source, record.length, map(record.frame, range(len(record))), Abilities())
 

@@ -1,32 +1,27 @@
-"""Episodes for other programs: recordings, trajectories in the TUM format, and datasets of Minari."""
+"""Episodes recorded with what vehicles measure: the recordings of logs and of comparisons."""
 
-import os
-import shutil
-import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from io import StringIO
-from itertools import product
-from pathlib import Path
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.api.terms.layout import action_space, observation_layout, observation_space
-from coopenv.base.errors import CoopenvError, OutputError
-from coopenv.base.files import check_new, replace_text, replacing_folder, writing
-from coopenv.base.installation import environment, install_command, needing, version
-from coopenv.estimation.poses import quaternion_wxyz
-from coopenv.estimation.trajectory import Trajectory
-from coopenv.evaluation.episodes import Views, play
+from coopenv.episode import RECORDED, Episode, Origin, Views
+from coopenv.evaluation.episodes import play
 from coopenv.observers.faults import Interference, interference_of, stacked
 from coopenv.observers.recording import Drawn, Recording
 from coopenv.observers.sensed import Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
-from coopenv.scenario import Scenario, ScenarioLike
+from coopenv.scenario import ScenarioLike
 from coopenv.sources.base import Backend
 from coopenv.sources.sources import open_backend
+
+
+def source_of(engine: Engine, name: str, seed: int | None, policy: str) -> Origin:
+    """Return the heading of an episode; a recording has no seed and no driver, a prescribed motion no driver."""
+    scenario, recorded = engine.backend.scenario, engine.backend.capabilities.recorded
+    driver = policy if scenario.driven and not recorded else ""
+    return Origin.of(name, scenario, policy=driver, seed=None if recorded else seed)
 
 
 def record(
@@ -48,232 +43,58 @@ def record(
     Raises:
         CoopenvError: unknown policy or observer, or the backend cannot begin.
     """
+    return record_episode(source, seed, policy, on_progress, on_tick).measured
+
+
+def record_episode(
+    source: ScenarioLike | Backend,
+    seed: int = 0,
+    policy: str | Policy = "zero",
+    on_progress: Callable[[float], None] = lambda share: None,
+    on_tick: Callable[[Engine, int], None] = lambda engine, tick: None,
+    name: str = "",
+    more: Sequence[str] = (),
+) -> Episode:
+    """Return the episode of a backend with its recording.
+
+    Arguments are those of `record`, and `name`, which stands in its heading, and fields of the engine that are recorded
+    beside the usual ones.
+    """
     backend = source if isinstance(source, Backend) else open_backend(source, None, {})
     scenario = backend.scenario
     driver = load_policy(policy, scenario, seed)
     engine = Engine(scenario, 1, "float64", backend=backend)
-    views = Views(engine, ("rotation", "position", "estimate_rotation", "estimate_position", "inbox_tick"))
+    views = Views(engine, (*RECORDED, *more))
     ticks: list[Sensed] = []
     faults: list[Interference | None] = []
     drawn = None
     for k in play(engine, [seed], scenario.horizon_ticks, driver if scenario.driven else None):
         views.take()
         if k == 0 and backend.capabilities.batched:
-            key, episode, parameters = (engine.view(name)[0].tolist() for name in ("seed", "episode", "parameter"))
-            drawn = Drawn(key, episode, tuple(parameters))
+            key, number, parameters = (engine.view(name)[0].tolist() for name in ("seed", "episode", "parameter"))
+            drawn = Drawn(key, number, tuple(parameters))
         ticks.append(engine.world.sensed(0, k))
         faults.append(interference_of(scenario, engine.world.model, engine.view, 0, k))
         on_tick(engine, k)
         on_progress(k / scenario.horizon_ticks)
     L, observer_init = len(scenario.landmarks), engine.world.observer_init
     kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in ticks[0].measured()}
-    start_rotation = views["estimate_rotation"][0, 0]
-    return Recording(
+    episode = views.episode(scenario, source_of(engine, name, seed, policy if isinstance(policy, str) else "custom"))
+    recording = Recording(
         setups=observer_init.setups,
         order=observer_init.order,
         dt=observer_init.dt,
         period=observer_init.period,
         staleness=observer_init.staleness,
         due=is_due(np.arange(len(ticks)), engine.world.model.observer.rate / scenario.rates.camera),
-        inbox_tick=views["inbox_tick"][:, 0].astype(np.int64),
-        start_rotation=start_rotation,
-        start_position=(start_rotation @ views["estimate_position"][0, 0][..., None])[..., 0],
+        inbox_tick=episode["inbox_tick"].astype(np.int64),
+        start_rotation=episode.rows["rotation_estimate"][0],
+        start_position=episode.rows["position_estimate"][0],
         start_covariance=observer_init.start_covariance,
-        truth=Truth(views["rotation"][:, 0, L:], views["position"][:, 0, L:]),
+        truth=Truth(episode["target_rotation"][:, L:], episode["target_position"][:, L:]),
         scenario=scenario,
         drawn=drawn,
         interference=stacked(faults),
         **kept,
     )
-
-
-def write_tum(trajectory: Trajectory, folder: str | Path) -> list[Path]:
-    """Write `VEHICLE_truth.tum` and `VEHICLE_estimate.tum` of every vehicle, and return their paths.
-
-    Poses are of the body in the map frame, m; ticks at which a pose is not finite are left out.
-
-    Raises:
-        OutputError: the folder cannot be made or written to.
-    """
-    folder = Path(folder)
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for i, name in enumerate(trajectory.vehicles.tolist()):
-        poses = {
-            "truth": (trajectory.position[:, i], trajectory.rotation[:, i]),
-            "estimate": (trajectory.position_estimate[:, i], trajectory.rotation_estimate[:, i]),
-        }
-        for kind, (position, rotation) in poses.items():
-            known = np.isfinite(position).all(axis=1) & np.isfinite(rotation).all(axis=(1, 2))
-            quaternion = quaternion_wxyz(rotation[known])[:, [1, 2, 3, 0]]
-            text = StringIO()
-            np.savetxt(text, np.column_stack([trajectory.t[known], position[known], quaternion]), "%.9f")
-            paths.append(folder / f"{name}_{kind}.tum")
-            replace_text(paths[-1], text.getvalue())
-    return paths
-
-
-KEPT = ("observation", "actions", "reward", "terminated", "truncated", "position_error")
-
-
-@dataclass(frozen=True)
-class DrivenEpisode:
-    """Observations, actions and rewards of one vehicle until it ended or its world did; T decisions."""
-
-    world: int
-    vehicle: str
-    observations: np.ndarray
-    """(T + 1, D) float32, from the start to the last."""
-    actions: np.ndarray
-    """(T, A) float32 in [-1, 1]."""
-    rewards: np.ndarray
-    """(T,)."""
-    terminations: np.ndarray
-    """(T,) bool: it arrived, collided or fulfilled another condition."""
-    truncations: np.ndarray
-    """(T,) bool: the horizon cut it off."""
-    position_error: np.ndarray
-    """(T + 1,) m, against the truth."""
-
-
-def drive_vehicles(
-    scenario: Scenario,
-    policy: Policy,
-    seed: int,
-    worlds: int,
-    on_progress: Callable[[float], None] = lambda share: None,
-) -> list[DrivenEpisode]:
-    """Let a policy drive an episode in every world of a seed; return one per acting vehicle that is there.
-
-    Args:
-        scenario: has acting vehicles.
-        policy: chooses for all rows, (world, vehicle).
-        seed: of the batch, as of `make_vec(...).reset(seed=...)`.
-        worlds: number of worlds.
-        on_progress: called with the share of the horizon that is done.
-
-    Raises:
-        CoopenvError: nothing is driven, or the policy returns something else than actions.
-    """
-    if not any(scenario.acting):
-        raise CoopenvError("all motion here is prescribed or has a driver, there is nothing to drive")
-    engine = Engine(scenario, worlds)
-    kept, ticks = Views(engine, KEPT), scenario.horizon_ticks
-    for tick in play(engine, seed, ticks, policy, False, stride=scenario.ticks_per_decision):
-        kept.take()
-        on_progress(tick / ticks)
-        if tick == 0:
-            there = engine.view("alive").copy()
-    engine.close()
-    observations, actions, rewards, terminated, truncated, errors = (kept[name] for name in KEPT)
-    driven, ended, episodes = actions[1:], ((terminated + truncated) > 0)[1:], []
-    for world, vehicle in product(range(worlds), np.flatnonzero(scenario.acting)):
-        if not there[world, vehicle]:
-            continue
-        length = int(next(iter(np.flatnonzero(ended[:, world, vehicle])), len(driven) - 1)) + 1
-        before, after, whole = slice(length), slice(1, length + 1), slice(length + 1)
-        episodes.append(
-            DrivenEpisode(
-                world=world,
-                vehicle=scenario.vehicle_names[vehicle],
-                observations=observations[whole, world, vehicle],
-                actions=driven[before, world, vehicle],
-                rewards=rewards[after, world, vehicle].astype(float),
-                terminations=terminated[after, world, vehicle].astype(bool),
-                truncations=truncated[after, world, vehicle].astype(bool),
-                position_error=errors[whole, world, vehicle].astype(float),
-            )
-        )
-    return episodes
-
-
-FILES = ("main_data.hdf5", "metadata.json")
-"""Files of a dataset, in its folder `data`."""
-PER_EPISODE = 1 << 16
-"""Bytes that an episode takes at most besides its arrays."""
-
-
-def dataset_place(identity: str, root: Path | None, force: bool) -> Path:
-    """Return the folder of a dataset's files.
-
-    Args:
-        identity: `namespace/name-v0`.
-        root: folder of datasets; None: Minari's own, the variable MINARI_DATASETS_PATH or ~/.minari/datasets.
-        force: permit an existing one.
-
-    Raises:
-        CoopenvError: Minari is not installed, or the identity is not one.
-        OutputError: the dataset is there.
-    """
-    with needing(f"a dataset needs Minari: {install_command('minari')}"):
-        import h5py  # noqa: F401 (Minari imports it late)
-        from minari.dataset.minari_dataset import parse_dataset_id
-    try:
-        parse_dataset_id(identity)
-    except (ValueError, TypeError):
-        raise CoopenvError(
-            f"--id {identity}: expected NAMESPACE/NAME-v0, each two or more letters, digits, - and _"
-        ) from None
-    own = os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets"
-    place = (root or Path(own)) / identity / "data"
-    check_new(place, force, place.parent)
-    return place
-
-
-def write_dataset(
-    episodes: Sequence[DrivenEpisode], scenario: Scenario, spec: Any, place: Path, identity: str, facts: dict[str, str]
-) -> None:
-    """Write episodes as a dataset, which takes the place of an older one.
-
-    Args:
-        episodes: in their order.
-        scenario: scenario of the episodes.
-        spec: Gymnasium's, of the environment that readers recover; None: of none.
-        place: the result of `dataset_place`.
-        identity: the dataset's.
-        facts: Minari's entries of algorithm and description.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
-    size = sum(value.nbytes for episode in episodes for value in vars(episode).values() if hasattr(value, "nbytes"))
-    needed = 2 * size + PER_EPISODE * len(episodes)
-    with writing(place):  # HDF5 ends the process where the disk has no room (seen with h5py 3.16)
-        free = shutil.disk_usage(next(folder for folder in place.absolute().parents if folder.is_dir())).free
-        if free < needed:
-            sizes = f"{needed / 2**20:.1f} MiB, {free / 2**20:.1f} MiB are free"
-            raise OutputError(f"cannot write to {place.parent}: the dataset may need {sizes}")
-        place.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        replacing_folder(place, FILES) as new,
-        environment({"MINARI_DATASETS_PATH": str(new)}),
-        warnings.catch_warnings(action="ignore", category=UserWarning),  # notes on authors
-        writing(place),
-    ):
-        import minari
-        from minari.data_collector import EpisodeBuffer
-
-        arrays = ("observations", "actions", "rewards", "terminations", "truncations")
-        buffers: list[Any] = [
-            EpisodeBuffer(
-                id=number,
-                options={"world": episode.world, "vehicle": int(episode.vehicle.rpartition("_")[2])},
-                infos={"position_error": episode.position_error},
-                **{name: getattr(episode, name) for name in arrays},
-            )
-            for number, episode in enumerate(episodes)
-        ]
-        minari.create_dataset_from_buffers(
-            dataset_id=identity,
-            buffer=buffers,
-            env=spec,
-            requirements=[f"coopenv=={version()}"],
-            data_format="hdf5",
-            observation_space=observation_space(observation_layout(scenario)),
-            action_space=action_space(scenario),
-            **facts,
-        )
-        for file in FILES:
-            (new / identity / "data" / file).rename(new / file)
-        shutil.rmtree(new / identity.split("/")[0])
+    return replace(episode, recording=recording)

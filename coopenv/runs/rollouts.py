@@ -13,21 +13,17 @@ from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError, explained
 from coopenv.base.installation import version
-from coopenv.estimation import Outcome, Sight
+from coopenv.episode import Episode, Views
+from coopenv.estimation import Outcome
 from coopenv.estimation.metrics import CONVERGED, mean_targets_in_view, observability_of, steady_mean, summarise
 from coopenv.estimation.observability import ConvergenceRates, Observability, convergence_rates, least_mean
 from coopenv.estimation.poses import position_covariance, roll_pitch_yaw_deg
 from coopenv.estimation.trajectory import Trajectory
-from coopenv.evaluation.episodes import Views, estimated_here, play
+from coopenv.evaluation.episodes import estimated_here, play
 from coopenv.policies import Policy, load_policy
+from coopenv.runs.recorder import source_of
 from coopenv.scenario import Scenario, ScenarioLike, load_scenario
 from coopenv.sources.base import EPISODE_OVER, Backend
-
-RECORDED = (
-    *("position", "rotation", "velocity", "angular_velocity", "estimate_rotation", "estimate_position"),
-    *("covariance", "position_error", "orientation_error", "nees", "protection_level", "sight", "terms", "ended"),
-)
-"""Views of the engine that are kept of every camera tick."""
 
 
 class Ending(NamedTuple):
@@ -68,7 +64,7 @@ class Rollout:
             self.ticks_planned = min(self.ticks_planned, steps * scenario.ticks_per_decision)
         self.wall_time = 0.0
         self._options = options
-        self._views = Views(self.engine, RECORDED)
+        self._views = Views(self.engine)
 
     @property
     def vehicles(self) -> tuple[int, ...]:
@@ -91,7 +87,7 @@ class Rollout:
             CoopenvError: an estimate is not finite.
         """
         start = perf_counter()
-        self._views = Views(self.engine, RECORDED)
+        self._views = Views(self.engine)
         self.wall_time = 0.0
         moments = play(self.engine, [self.seed], self.ticks_planned, self.policy, False, self._options)
         for tick in moments:
@@ -111,35 +107,17 @@ class Rollout:
             time = tick / self.scenario.rates.camera
             raise CoopenvError(f"observer '{name}' at {vehicle} at {time:.3f} s: its estimate is not finite")
 
-    def _recorded(self, name: str) -> np.ndarray:
-        """Return (K, ...) of one view."""
-        return self._views[name][:, 0]
+    def episode(self, name: str = "") -> Episode:
+        """Return the record so far, of what has a name; `play` must have yielded at least once."""
+        return self._views.episode(self.scenario, source_of(self.engine, name, self.seed, self.policy_name))
 
     def trajectory(self) -> Trajectory:
-        """Return the recording so far; `play` must have yielded at least once."""
-        L, recorded = len(self.scenario.landmarks), self._recorded
-        rotation_estimate, sight = recorded("estimate_rotation"), recorded("sight")
-        moving = [landmark.motion.kind != "static" for landmark in self.scenario.landmarks]
-        return Trajectory(
-            t=np.arange(len(sight)) / self.scenario.rates.camera,
-            position_estimate=(rotation_estimate @ recorded("estimate_position")[..., None])[..., 0],
-            rotation_estimate=rotation_estimate,
-            target_position=recorded("position"),
-            visible=sight == Sight.VISIBLE,
-            sight=sight,
-            reward_terms=recorded("terms"),
-            terms=np.array(self.engine.reward_terms),
-            vehicles=np.array(self.scenario.vehicle_names),
-            targets=np.array(self.scenario.target_names),
-            target_moving=np.array([*moving, *(True for _ in self.scenario.vehicles)]),
-            **{name: recorded(name) for name in ("position_error", "orientation_error", "nees")},
-            **{name: recorded(name) for name in ("covariance", "protection_level")},
-            **{name: recorded(name)[:, L:] for name in ("position", "rotation", "velocity", "angular_velocity")},
-        )
+        """Return the trajectories so far; `play` must have yielded at least once."""
+        return self.episode().trajectory
 
     def endings(self, vehicles: Sequence[int] | None = None) -> list[Ending]:
         """Return the end of each vehicle's run so far (None: of the vehicles that are estimated here)."""
-        ended = self._recorded("ended")[:, [*(self.vehicles if vehicles is None else vehicles)]]
+        ended = self._views["ended"][:, 0][:, [*(self.vehicles if vehicles is None else vehicles)]]
         first = np.where(ended.any(axis=0), np.argmax(ended != 0, axis=0), len(ended) - 1)
         words, times = outcome_words(self.scenario), (first / self.scenario.rates.camera).tolist()
         return [Ending(words[outcome], time) for outcome, time in zip(ended[-1].tolist(), times, strict=True)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
+from dataclasses import replace
 from importlib.util import find_spec
 from math import ceil
 from pathlib import Path
@@ -16,17 +17,18 @@ from rich.console import Console
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, list_envs
+from coopenv.episode import SCENE_FILE, Episode, Origin, Views
 from coopenv.evaluation.episodes import play
-from coopenv.observers import run
 from coopenv.observers.recording import Recording
-from coopenv.observers.registry import named, observer_of_robots, states_covariance
+from coopenv.observers.registry import named, observer_of_robots, with_observer
 from coopenv.policies import Policy, agents_for, find_agent, load_policy
 from coopenv.runs.console import Progress, compile_notice
+from coopenv.runs.recorder import record_episode, source_of
 from coopenv.scenario import Scenario
 from coopenv.sources.base import Backend
 from coopenv.sources.mcap import log_views, write_recording
 from coopenv.sources.registry import kind_of
-from coopenv.viz.scene import SCENE_FILE, Frame, Origin, SceneRecord
+from coopenv.sources.worlds import Replay
 
 BASELINE = "route_follower"
 LOOKING = ("look_ahead", "peek")
@@ -40,43 +42,13 @@ def frame_stride(scenario: Scenario) -> int:
     return scenario.ticks_per_decision * max(1, ceil(scenario.rates.decision / MAX_FPS - 1e-9))
 
 
-def source_of(engine: Engine, name: str, seed: int | None, policy: str) -> Origin:
-    """Return the heading of a scene; a recording has no seed and no driver, a prescribed motion no driver."""
-    scenario, recorded = engine.backend.scenario, engine.backend.capabilities.recorded
-    driver = policy if scenario.driven and not recorded else ""
-    return Origin.of(name, scenario, policy=driver, seed=None if recorded else seed)
-
-
-class Keeper:
-    """Keeps the frames of an episode that pictures are made of, at most `MAX_FPS` a second."""
-
-    def __init__(self, engine: Engine, source: Origin) -> None:
-        """Begin with none."""
-        self.engine, self._source = engine, source
-        self._stride = frame_stride(engine.backend.scenario)
-        self._frames: list[Frame] = []
-
-    def tick(self, tick: int) -> bool:
-        """Store the state at a tick if the tick is drawn; return whether it is."""
-        drawn = tick % self._stride == 0
-        if drawn:
-            self._frames.append(Frame.of(self.engine))
-        return drawn
-
-    def record(self) -> SceneRecord:
-        """Return the stored frames and the present one."""
-        if not self._frames or self.engine.view("tick")[0] > self._frames[-1].tick:
-            self._frames.append(Frame.of(self.engine))
-        return SceneRecord.of_frames(self.engine.backend.scenario, self._source, self._frames)
-
-
 def scene_of(
     engine: Engine,
     source: Origin,
     policy: Policy | None = None,
     on_progress: Callable[[float], None] = lambda share: None,
     longest: float = np.inf,
-) -> SceneRecord:
+) -> Episode:
     """Play an episode in the first world of an engine and return its scene.
 
     Args:
@@ -89,12 +61,16 @@ def scene_of(
     Raises:
         CoopenvError: the policy fails, or the backend cannot begin.
     """
-    keeper, scenario = Keeper(engine, source), engine.backend.scenario
-    ticks = int(min(scenario.horizon_ticks, longest * scenario.rates.camera))
+    views, scenario = Views(engine), engine.backend.scenario
+    ticks, stride = int(min(scenario.horizon_ticks, longest * scenario.rates.camera)), frame_stride(scenario)
+    tick = 0
     for tick in play(engine, [source.seed or 0], ticks, policy, to_the_end=False):
-        if keeper.tick(tick):
+        if tick % stride == 0:
+            views.take()
             on_progress(tick / ticks)
-    return keeper.record()
+    if tick % stride:
+        views.take()
+    return views.episode(scenario, source)
 
 
 def played_scene(
@@ -105,7 +81,7 @@ def played_scene(
     policy: Policy | None = None,
     driver: str = "",
     longest: float = np.inf,
-) -> SceneRecord:
+) -> Episode:
     """Play an episode of a backend with progress shown and return its scene; arguments as for `scene_of`.
 
     `name` and `driver` stand in its heading.
@@ -117,7 +93,7 @@ def played_scene(
             return scene_of(engine, source_of(engine, name, seed, driver), policy, progress.update, longest)
 
 
-def saved_scene(name: str | Path) -> SceneRecord | None:
+def saved_scene(name: str | Path) -> Episode | None:
     """Return the scene in the folder of a run, or of a file `*.npz`; None: the name means something else.
 
     Raises:
@@ -127,9 +103,9 @@ def saved_scene(name: str | Path) -> SceneRecord | None:
     if str(name) in list_envs():
         return None  # a folder that is called like an environment is ./NAME
     if path.suffix == ".npz":
-        return SceneRecord.load(path)
+        return Episode.load(path)
     if (path / SCENE_FILE).is_file():
-        return SceneRecord.load(path / SCENE_FILE)
+        return Episode.load(path / SCENE_FILE)
     if any((path / kept).is_file() for kept in ("trajectory.npz", "metrics.json")):
         raise CoopenvError(f"{path}: has no {SCENE_FILE}, which `coopenv run` writes since 0.2; run it again")
     return None
@@ -165,7 +141,7 @@ def title_of(name: str) -> str:
     return path.name if kind_of(name).recorded else path.stem
 
 
-def write_page(record: SceneRecord, path: Path, log: Console, others: Mapping[str, str] | None = None) -> Path | None:
+def write_page(record: Episode, path: Path, log: Console, others: Mapping[str, str] | None = None) -> Path | None:
     """Write the page that plays a scene, with progress shown; None, and a line, where the extra `view` is missing.
 
     `others` are the pages of all drivers by their names, to which this one leads.
@@ -213,10 +189,12 @@ def write_log(recording: Recording, path: Path, log: Console, observer: str | No
     if scene:
         name = named(observer or observer_of(recording))
         with Progress(log, f"estimating with {name}"):
-            result = run(name, recording)
-        if result.failure:
-            raise CoopenvError(f"observer {name} failed: {result.failure}; --no-scene writes the recording alone")
+            try:
+                played = record_episode(Replay(recording, path.name, with_observer({}, name)))
+            except CoopenvError as error:
+                raise CoopenvError(f"{error}; --no-scene writes the recording alone") from None
+        episode = replace(played, recording=recording)
         for program in log_views().values():
-            shown += program.views(recording, result, start=start, gain=not states_covariance(name))
+            shown += program.views(episode, start=start)
     with Progress(log, f"writing {path.name}"):
         write_recording(recording, path, views=shown, start=start)

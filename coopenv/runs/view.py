@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, error_text
+from coopenv.episode import Frame
 from coopenv.runs.live import FAULTS, Reel
 from coopenv.runs.scenes import MAX_FPS
-from coopenv.viz.scene import Frame
 from coopenv.viz.stage import Stage, entries
 from coopenv.viz.web import aim
 from coopenv.viz.web_panel import LONGEST, NO_FAULT, Panel
@@ -111,8 +111,8 @@ class Viewer:
         with self._server.atomic():
             self._picture.show(self._frame, self.shown if self.playing else None)
             place = np.zeros(3)
-            if picked is not None and self._look.follow and np.isfinite(self._frame.vehicle_position[picked]).all():
-                place = self._stage.middle - [*self._frame.vehicle_position[picked, :2], 0.0]
+            if picked is not None and self._look.follow and np.isfinite(self._frame.position[picked]).all():
+                place = self._stage.middle - [*self._frame.position[picked, :2], 0.0]
             self._picture.ground.root.position = tuple(np.round(place, 4).tolist())
             frames = self._reel.frames[max(0, self._k + 1 - LONGEST) : self._k + 1]
             self._panel.show(frames, now, exact=not self.playing)
@@ -125,7 +125,7 @@ class Viewer:
             return
         self._faded_at = now
         picked = self._look.picked
-        places = self._frame.vehicle_position[[picked]] if picked is not None else self._frame.vehicle_position
+        places = self._frame.position[[picked]] if picked is not None else self._frame.position
         root = np.array(self._picture.ground.root.position)
         places = places[np.isfinite(places).all(axis=1)]
         eyes = [np.array(client.camera.position) - root for client in self._server.get_clients().values()]

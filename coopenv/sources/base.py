@@ -168,8 +168,10 @@ class Repeating(Protocol):
         ...
 
 
-Episode = Generator[Sensed, Command, None]
+TickStream = Generator[Sensed, Command, None]
 """Yields tick 0, and then one tick for every command that it is sent; it ends by returning, or by being closed."""
+Episode = TickStream
+"""Former name of `TickStream`."""
 
 
 IGNORED_OPTIONS = ("options", "arm")
@@ -194,10 +196,10 @@ class TickGenerator(ABC):
         self.capabilities = capabilities
         self.health = Health()
         self.clock = 0.0
-        self._episode: Episode | None = None
+        self._episode: TickStream | None = None
 
     @abstractmethod
-    def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
+    def episode(self, seed: int | None, options: Mapping[str, Any]) -> TickStream:
         """Return a new episode; arguments as for `Backend.reset`."""
 
     def reset(self, seed: int | None, options: Mapping[str, Any]) -> Sensed:

@@ -21,7 +21,7 @@ from coopenv.observers.sensed import Sensed, Truth, is_due
 from coopenv.scenario import Scenario, parse_scenario
 from coopenv.scenario.files import override
 from coopenv.scenario.schema import neighbour_sets, processing_order
-from coopenv.sources.base import Capabilities, Episode, SensingWorld, TickGenerator
+from coopenv.sources.base import Capabilities, SensingWorld, TickGenerator, TickStream
 from coopenv.sources.feed import RECORDED, Feed
 from coopenv.world.embedded import HOST
 
@@ -112,7 +112,7 @@ class Simulated(TickGenerator):
         start = start_covariances(self.scenario)
         return self.kind(self.scenario, worlds, dtype, device, threads, observer, start)
 
-    def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
+    def episode(self, seed: int | None, options: Mapping[str, Any]) -> TickStream:
         """Simulate one world in float64, without an observer: deliveries do not depend on the contents of messages."""
         if self._world is None:
             self._world = self.kind(self.scenario, 1, "float64", "cpu", 1)
@@ -346,7 +346,7 @@ class Replay(TickGenerator):
         covariance = self.recording.start_covariance
         return ReplayWorld(self.recording, self.scenario, worlds, dtype, device, threads, observer, covariance)
 
-    def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
+    def episode(self, seed: int | None, options: Mapping[str, Any]) -> TickStream:
         """Go through the recording tick by tick."""
         recording = self.recording
         age = recording.odometry_age(self.scenario.rates.odometry)

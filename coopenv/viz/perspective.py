@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from coopenv.episode import Frame
 from coopenv.estimation import Sight
 from coopenv.estimation.lens import distort
 from coopenv.scenario.sensing import Camera, rotation_of
-from coopenv.viz.scene import Frame
 from coopenv.viz.stage import Box, Stage
 from coopenv.viz.style import DARK_BLUE, GREY, INK, NOTE, vehicle_colour
 from coopenv.viz.topview_ground import GROUND, ROOF, TRAFFIC, WALL
@@ -31,7 +31,7 @@ def camera_image(stage: Stage, frame: Frame, vehicle: int) -> np.ndarray:
     width, height = lens.size
     image = Image.new("RGB", (_SCALE * width, _SCALE * height), SKY)
     draw = ImageDraw.Draw(image)
-    if np.isfinite(frame.vehicle_position[vehicle]).all():
+    if np.isfinite(frame.position[vehicle]).all():
         _draw_ground(draw, lens)
         far = sorted(_boxes(stage, frame, vehicle), key=lambda each: -float(np.linalg.norm(each[0].center - lens.eye)))
         for box, colour, edge in far:
@@ -53,7 +53,7 @@ class Lens:
         self.eye = stage.eyes(frame)[vehicle]
         pan = float(frame.pan[vehicle])
         to_body = rotation_of(pan, None) if self.around else self._camera.to_body(pan)
-        self._to_map = frame.vehicle_rotation[vehicle] @ to_body
+        self._to_map = frame.rotation[vehicle] @ to_body
 
     def in_camera(self, points: np.ndarray) -> np.ndarray:
         """Return points (..., 3) of the map in the camera's frame; z ahead, but of a panorama x ahead and z up."""

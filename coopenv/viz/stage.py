@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from coopenv.episode import Frame, semi_axes
 from coopenv.estimation import Sight
 from coopenv.estimation.lens import largest_radius, undistort
 from coopenv.scenario import Scenario
@@ -16,7 +17,6 @@ from coopenv.scenario.bodies import Body, Landmark, Vehicle
 from coopenv.scenario.routes import compile_motion, even_points, left_jacobian
 from coopenv.scenario.schema import agent_starts
 from coopenv.scenario.sensing import Camera, rotation_of
-from coopenv.viz.scene import Frame, semi_axes
 
 _CIRCLE = np.linspace(0.0, 2 * np.pi, 97)
 CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
@@ -281,11 +281,11 @@ class Stage:
 
     def eyes(self, frame: Frame) -> np.ndarray:
         """Return the positions (N, 3) of cameras."""
-        return np.asarray(frame.vehicle_position + (frame.vehicle_rotation @ self.camera[..., None])[..., 0])
+        return np.asarray(frame.position + (frame.rotation @ self.camera[..., None])[..., 0])
 
     def targets(self, frame: Frame) -> np.ndarray:
         """Return the points that cameras see, (A, 3)."""
-        return np.asarray(frame.position + (frame.rotation @ self.marker[..., None])[..., 0])
+        return np.asarray(frame.target_position + (frame.target_rotation @ self.marker[..., None])[..., 0])
 
     def fields_of_view(self, frame: Frame, every: int = 1, of: slice = _ALL) -> np.ndarray | None:
         """Return the fields of view in plan as polygons (N, K + 1, 3), the camera first; None where all see everything.
@@ -296,7 +296,7 @@ class Stage:
             return None
         eye = self.eyes(frame)[of]
         turned = np.array([rotation_of(pan, None) for pan in frame.pan[of]]).reshape(-1, 3, 3)
-        rays = self._fan[of, ::every] @ np.swapaxes(frame.vehicle_rotation[of] @ turned, 1, 2)
+        rays = self._fan[of, ::every] @ np.swapaxes(frame.rotation[of] @ turned, 1, 2)
         length = free_lengths(eye, rays, self.reach[of], self.buildings)
         return np.concatenate([eye[:, None], eye[:, None] + length[..., None] * rays], axis=1)
 
@@ -324,8 +324,8 @@ class Stage:
         boxes = []
         for i, agent in enumerate(self._agents):
             if (body := agent.body) is not None and i not in without:
-                R = frame.rotation[i]
-                boxes.append(Box(self.short_name(i), R, frame.position[i] + R @ body.center, body.size, i))
+                R = frame.target_rotation[i]
+                boxes.append(Box(self.short_name(i), R, frame.target_position[i] + R @ body.center, body.size, i))
         there = np.flatnonzero(frame.traffic_half[:, 0] > 0.0)
         R, center, size = frame.traffic_rotation, frame.traffic_position, 2.0 * frame.traffic_half
         return boxes + [Box("traffic", R[z], center[z], size[z]) for z in there]

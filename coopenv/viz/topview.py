@@ -8,13 +8,13 @@ from matplotlib.patches import Rectangle
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.format import fixed
+from coopenv.episode import Frame, FrameSource
 from coopenv.estimation import Outcome
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Body
 from coopenv.viz import stage as geometry
 from coopenv.viz import topview_ground as ground
-from coopenv.viz.scene import Frame, FrameSource
 from coopenv.viz.stage import Stage
 from coopenv.viz.style import DARK_BLUE, INK, NORMAL, vehicle_colour
 from coopenv.viz.topview_ground import Goals, Layers
@@ -222,23 +222,25 @@ class TopView:
 
     def _place_ellipses(self, frame: Frame) -> None:
         """Place the 3-sigma ellipses of estimates in sight, but for large ones."""
-        stage, estimate = self._stage, frame.estimate_position[:, :2]
+        stage, estimate = self._stage, frame.position_estimate[:, :2]
         shapes, semi = geometry.ellipses(estimate, frame.position_covariance[:, :2, :2])
         inside = np.all((estimate >= stage.low) & (estimate <= stage.high), axis=-1)
         shapes[~inside | ~(semi <= ground.LARGEST_ELLIPSE * stage.side) | self._gain] = np.nan
         self._ellipses.set_verts(shapes)
 
     def _place_bodies(self, frame: Frame) -> None:
-        R, R_hat, outlines = frame.vehicle_rotation, frame.estimate_rotation, geometry.outlines
-        place = frame.vehicle_position[:, :2]
-        guess = self._stage.nearer(frame.estimate_position[:, :2], _FARTHEST)
+        R, R_hat, outlines = frame.rotation, frame.rotation_estimate, geometry.outlines
+        place = frame.position[:, :2]
+        guess = self._stage.nearer(frame.position_estimate[:, :2], _FARTHEST)
         self._truth.set_verts(outlines(R, place, self._box))
         self._truth_nose.set_verts(outlines(R, place, self._nose))
         self._casing.set_verts(outlines(R_hat, guess, self._box))
         self._estimate.set_verts(outlines(R_hat, guess, self._box))
         self._estimate_nose.set_verts(outlines(R_hat, guess, self._nose))
         others = self._others
-        self._other.set_verts(outlines(frame.rotation[others], frame.position[others, :2], self._other_box))
+        self._other.set_verts(
+            outlines(frame.target_rotation[others], frame.target_position[others, :2], self._other_box)
+        )
         self._links.set_segments(list(np.stack([place, guess], axis=1)))
         corners, size = (self._stage.low, self._stage.high), _POINTER * self._pixel
         self._pointers.set_verts(geometry.pointers(place, guess, *corners, size))
@@ -260,11 +262,11 @@ class TopView:
         for i, name in self._moving_names.items():
             name.set_visible(bool(np.isfinite(target[i]).all()))
             body = self.scenario.landmarks[i].body
-            above = 0.0 if body is None else float(np.abs(frame.rotation[i, 1]) @ np.array(body.size) / 2)
+            above = 0.0 if body is None else float(np.abs(frame.target_rotation[i, 1]) @ np.array(body.size) / 2)
             name.xy = (float(target[i, 0]), float(target[i, 1]) + above)
 
     def _place_marks(self, frame: Frame) -> None:
-        R, position = frame.vehicle_rotation, frame.vehicle_position[:, :2]
+        R, position = frame.rotation, frame.position[:, :2]
         place = geometry.outlines(R, position, self._box.mean(axis=1, keepdims=True))[:, 0]
         self._arrived.set_data(*place[frame.ended == Outcome.ARRIVED].T)
         self._collided.set_data(*place[frame.ended == Outcome.COLLIDED].T)

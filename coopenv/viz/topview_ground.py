@@ -16,13 +16,13 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation, Text
 from scipy.spatial.transform import Rotation
 
+from coopenv.episode import Frame
 from coopenv.estimation import Sight
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.scenario.routes import even_points
 from coopenv.scenario.schema import agent_starts
 from coopenv.viz import style
-from coopenv.viz.scene import Frame
 from coopenv.viz.stage import CORNERS, Stage, nose_shapes, outlines, paths, roads, vehicle_mark, ways
 from coopenv.viz.style import (
     DARK_BLUE,
@@ -39,9 +39,9 @@ from coopenv.viz.style import (
 )
 
 WIDTH, HEIGHT = 896, 672  # px; multiples of 16, as video codecs like them
-LEFT, _BOTTOM, _SIDE = 54, 46, 592  # px, of the square axes
+LEFT, BOTTOM, SIDE = 54, 46, 592  # px, of the square axes
 _WORDS = 36  # px, from the axes to what is written beside them, whatever numbers stand between
-MAP_RIGHT, MAP_WIDTH = LEFT + _SIDE, LEFT + _SIDE + 6  # px, right edge of the axes, and with what stands out there
+MAP_RIGHT, MAP_WIDTH = LEFT + SIDE, LEFT + SIDE + 6  # px, right edge of the axes, and with what stands out there
 PANEL = MAP_RIGHT + 12  # px, left edge of the panel
 SMALLER = 6.5  # pt
 ROW = 16  # px
@@ -73,12 +73,12 @@ def pixels(x: float, y: float) -> tuple[float, float]:
 def new_ground(stage: Stage) -> tuple[Figure, Axes]:
     """Return a figure with everything that does not change during an episode."""
     figure = new_figure((WIDTH + 0.1) / DPI, (HEIGHT + 0.1) / DPI)
-    ax = figure.add_axes((*pixels(LEFT, _BOTTOM), *pixels(_SIDE, _SIDE)))
+    ax = figure.add_axes((*pixels(LEFT, BOTTOM), *pixels(SIDE, SIDE)))
     ax.set_facecolor(GROUND)
     style.tidy(ax, x_label="x [m]", y_label="y [m]")
     ax.grid(True, color="white", linewidth=0.8)
     ax.xaxis.labelpad = 1
-    ax.yaxis.set_label_coords(-_WORDS / _SIDE, 0.5)
+    ax.yaxis.set_label_coords(-_WORDS / SIDE, 0.5)
     ax.spines[:].set(visible=True, linewidth=0.6, color=GREY)
     ax.set(xlim=(stage.low[0], stage.high[0]), ylim=(stage.low[1], stage.high[1]))
     ax.set_aspect("equal")

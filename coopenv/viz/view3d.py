@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import check_one_of
 from coopenv.base.installation import install_command, needing
+from coopenv.episode import Frame, semi_axes
 from coopenv.estimation import Sight
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.viz import meshes, stage
 from coopenv.viz.meshes import ASPHALT, DARK, GRASS, GRID, HORIZON, MARKS, SUN, Mesh
-from coopenv.viz.scene import Frame, semi_axes
 from coopenv.viz.stage import Stage
 from coopenv.viz.style import DARK_BLUE, GREY, INK, rgb, vehicle_colour
 
@@ -86,10 +86,10 @@ class View3d:
 
     def paint(self, frame: Frame) -> np.ndarray:
         """Return an (H, W, 3) uint8 picture of a frame; estimates below their vehicles are drawn at their height."""
-        R, R_hat = frame.vehicle_rotation @ self._turn, frame.estimate_rotation @ self._turn
-        estimate = self._stage.nearer(frame.estimate_position, meshes.FAR)
-        estimate[:, 2] = np.maximum(estimate[:, 2], frame.vehicle_position[:, 2])
-        cars = self._boxes(R, frame.vehicle_position), self._boxes(R_hat, estimate)
+        R, R_hat = frame.rotation @ self._turn, frame.rotation_estimate @ self._turn
+        estimate = self._stage.nearer(frame.position_estimate, meshes.FAR)
+        estimate[:, 2] = np.maximum(estimate[:, 2], frame.position[:, 2])
+        cars = self._boxes(R, frame.position), self._boxes(R_hat, estimate)
         for parts, places in zip((self._cars, self._ghosts), cars, strict=True):
             for actors, place, shown in zip(parts, places, self._shown, strict=True):
                 for actor in actors:
@@ -102,7 +102,7 @@ class View3d:
         self._place_others(frame)
         pair = self._pair(frame) if self._camera == "pair" else None
         if pair is not None:
-            self._look_at_pair(frame.vehicle_position[pair], R[self._picked, :, 0])
+            self._look_at_pair(frame.position[pair], R[self._picked, :, 0])
         elif self._camera in ("follow", "driver"):
             self._move_camera(frame, R)
         self._plot.render()
@@ -190,7 +190,7 @@ class View3d:
         camera.up, camera.view_angle = (0.0, 0.0, 1.0), _ANGLE
 
     def _move_camera(self, frame: Frame, R: np.ndarray) -> None:
-        place, forward = frame.vehicle_position[self._picked], R[self._picked, :, 0]
+        place, forward = frame.position[self._picked], R[self._picked, :, 0]
         camera, length = self._plot.camera, float(self._size[self._picked, 0])
         if not np.isfinite(place).all():
             return
@@ -202,7 +202,7 @@ class View3d:
             pinhole = own.model == "pinhole"
             eye = self._stage.eyes(frame)[self._picked]
             axis = own.to_body(float(frame.pan[self._picked]))[:, 2] if pinhole else self._turn[self._picked, :, 0]
-            aim = eye + frame.vehicle_rotation[self._picked] @ axis
+            aim = eye + frame.rotation[self._picked] @ axis
             focal = own.focal_length[1] if pinhole else 1.0
             angle = 2.0 * np.degrees(np.arctan(own.image_size[1] / 2.0 / focal)) if pinhole else _LEFTMOST
         camera.position, camera.focal_point, camera.up = tuple(eye), tuple(aim), (0.0, 0.0, 1.0)
@@ -211,7 +211,7 @@ class View3d:
 
     def _pair(self, frame: Frame) -> list[int] | None:
         """Return the picked vehicle and the nearest other vehicle, or None if it has no true position."""
-        place = frame.vehicle_position
+        place = frame.position
         away = np.linalg.norm(place - place[self._picked], axis=1)
         away[self._picked] = np.inf
         if not np.isfinite(place[self._picked]).all():
@@ -236,7 +236,7 @@ class View3d:
         if before is None or frame.tick > before.tick:
             self._before = frame
         if before is not None and frame.tick > before.tick:
-            way = float(np.linalg.norm(frame.vehicle_position[other] - before.vehicle_position[other]))
+            way = float(np.linalg.norm(frame.position[other] - before.position[other]))
             speed = way / (frame.tick - before.tick) * self._stage.scenario.rates.camera
             self.waits = speed < _SLOW * self._stage.scenario.limits[other].max_speed
         seen = np.flatnonzero(frame.sight[picked] == Sight.VISIBLE)
@@ -255,7 +255,7 @@ class View3d:
             draw.text((0.02 * width, 0.97 * height), LEGEND, font=small, anchor="ls", **look)
         font = ImageFont.load_default(0.06 * height)
         for i, words in captions.items():
-            u, v = self.pixel(frame.vehicle_position[i])
+            u, v = self.pixel(frame.position[i])
             text = f"{stage.vehicle_mark(i)} {words}"
             if np.isfinite([u, v]).all():
                 left = min(u + 0.08 * width, width - draw.textlength(text, font) - 3)

@@ -25,8 +25,8 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
 from coopenv.base.installation import install_command, needing
+from coopenv.episode import Episode
 from coopenv.viz.meshes import Look
-from coopenv.viz.scene import SceneRecord
 from coopenv.viz.stage import Stage
 from coopenv.viz.style import thinned
 from coopenv.viz.web_panel import legend_html
@@ -216,7 +216,7 @@ _LOOPBACK = "127.0.0.1"
 
 
 def write_replay(
-    record: SceneRecord,
+    record: Episode,
     path: Path,
     on_progress: Callable[[float], None] = lambda share: None,
     others: Mapping[str, str] | None = None,
@@ -265,7 +265,7 @@ def aim(camera: object, stage: Stage, aspect: float = 1.6, raised: float = 0.0, 
         setattr(camera, name, value)
 
 
-def _dressed(page: str, record: SceneRecord, stage: Stage, look: Look, others: Mapping[str, str]) -> str:
+def _dressed(page: str, record: Episode, stage: Stage, look: Look, others: Mapping[str, str]) -> str:
     """Return viser's page with the title of the episode and the legend, and a camera for narrow screens."""
     title = escape(record.scenario.title)
     far, middle = first_camera(stage, aspect=0.52)

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.format import fixed
+from coopenv.episode import Frame, Origin, semi_axes
 from coopenv.estimation import Sight
 from coopenv.estimation.poses import error_dof
 from coopenv.viz.error_figures import nees_bounds
 from coopenv.viz.meshes import Look
 from coopenv.viz.perspective import camera_image
-from coopenv.viz.scene import Frame, Origin, semi_axes
 from coopenv.viz.stage import Stage, vehicle_mark
 from coopenv.viz.style import BLUE, DARK_BLUE, GREY, INK, VEHICLE_COLOURS, VERMILION, vehicle_colour
 from coopenv.viz.topview_ground import TRAFFIC
@@ -70,15 +70,14 @@ class Plots:
         # Observers that state no level have a curve as well: it lies on that of 3 sigma.
         level = np.minimum(level, UNKNOWN_LEVEL) if np.isfinite(level).any() else sigma
         self._error.data = (time, *map(_positive, (error, sigma, level)))
-        agent = vehicle - len(frames[0].nees)
         truth, estimate = (
-            [np.array([getattr(frame, name)[agent] for frame in frames]) for name in names]
-            for names in (("rotation", "position"), ("estimate_rotation", "estimate_position"))
+            [np.array([getattr(frame, name)[vehicle] for frame in frames]) for name in names]
+            for names in (("rotation", "position"), ("rotation_estimate", "position_estimate"))
         )
         bounds = nees_bounds(error_dof(*truth, *estimate))
         self._nees.data = (time, _positive(nees), *(np.full(len(time), bound) for bound in bounds))
         if self._terms:
-            terms = np.nan_to_num([frame.terms[vehicle, : self._terms] for frame in frames])
+            terms = np.nan_to_num([frame.reward_terms[vehicle, : self._terms] for frame in frames])
             self._reward.data = (time, *np.ascontiguousarray(terms.T))
 
 

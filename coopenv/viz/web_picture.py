@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.format import fixed
+from coopenv.episode import Frame, Origin, semi_axes
 from coopenv.estimation import Outcome, Sight
 from coopenv.viz import meshes
 from coopenv.viz.meshes import (
@@ -21,7 +22,6 @@ from coopenv.viz.meshes import (
     placed,
     update,
 )
-from coopenv.viz.scene import Frame, Origin, semi_axes
 from coopenv.viz.stage import Box, Stage, entries, vehicle_mark
 from coopenv.viz.style import DARK_BLUE, GREY, INK, rgb, vehicle_colour
 from coopenv.viz.topview_ground import TRAFFIC
@@ -71,9 +71,9 @@ class Actors:
 
     def place(self, frame: Frame, look: Look) -> None:
         """Move everything to where it is in a frame."""
-        R, R_hat, step, side = frame.vehicle_rotation, frame.estimate_rotation, self._floor.step, self._stage.side
-        at = fine(frame.vehicle_position + (R @ self._center[..., None])[..., 0], step)
-        estimated = self._near(frame.estimate_position + (R_hat @ self._center[..., None])[..., 0])
+        R, R_hat, step, side = frame.rotation, frame.rotation_estimate, self._floor.step, self._stage.side
+        at = fine(frame.position + (R @ self._center[..., None])[..., 0], step)
+        estimated = self._near(frame.position_estimate + (R_hat @ self._center[..., None])[..., 0])
         true, ghosts = placed(R, at, self._size), placed(R_hat, estimated, _SHELL * self._size)
         self.cars.put(true)
         self._arrows.put(true)
@@ -88,7 +88,7 @@ class Actors:
         drawn = semi[:, 2] <= _LARGEST * side
         steps = np.log2(np.maximum(np.where(drawn[:, None], semi, np.nan), step / 4)) * _STEPS
         semi = 2.0 ** (np.round(steps) / _STEPS)
-        self._ellipsoids.put(placed(axes, self._near(frame.estimate_position), semi, _TURN), look.ellipsoids)
+        self._ellipsoids.put(placed(axes, self._near(frame.position_estimate), semi, _TURN), look.ellipsoids)
         self._place_landmarks(frame)
         if len(frame.traffic_half):
             if self._traffic is None:
@@ -177,7 +177,7 @@ def level_lines(frame: Frame, colours: np.ndarray, look: Look, largest: float, z
     """Return circles of the protection levels, up to a radius, about the estimates at a height."""
     radius = frame.protection_level[:, 0]
     drawn = (look.levels | (np.arange(len(radius)) == look.picked)) & (radius <= largest)
-    points = frame.estimate_position[drawn, None] + radius[drawn, None, None] * _CIRCLE
+    points = frame.position_estimate[drawn, None] + radius[drawn, None, None] * _CIRCLE
     points[..., 2] = z
     segments = np.stack([points[:, :-1], points[:, 1:]], axis=2)  # (drawn, 32, 2, 3)
     return segments.reshape(-1, 2, 3), np.repeat(colours[drawn], segments.shape[1], axis=0)
@@ -197,7 +197,7 @@ class Trails:
         if not 0.0 <= time - self._time < 10.0 * _TRAIL_STEP:
             self._points.clear()
         if not self._points or time - self._time >= _TRAIL_STEP - 1e-9:
-            place = frame.vehicle_position.copy()
+            place = frame.position.copy()
             place[:, 2] += z - place[:, 2]
             self._points.append(place)
             self._time = time
@@ -287,7 +287,7 @@ class Labels:
                 label.text = self._text(frame, i)
         mine = in_turn(turn, stage.vehicles)
         above = self._above + 1.1 * pin_height(stage, look) * np.array([0.0, 0.0, 1.0])
-        places, estimates = frame.vehicle_position + above, frame.estimate_position + above
+        places, estimates = frame.position + above, frame.position_estimate + above
         places[:, 2] += _RAISED * side * levels(places[:, :2], _CLOSE * side)
         inside = np.all((estimates[:, :2] > stage.low) & (estimates[:, :2] < stage.high), axis=-1)
         named = inside & (frame.position_error > _APART * side)  # estimates away from their vehicles
@@ -366,7 +366,7 @@ class Picture:
         self._lines["trails"].show(trail if look.trails else NOTHING)
         sight = sight_lines(self.stage, frame, self._colours, look) if look.sight else NOTHING
         self._lines["sight"].show(sight)
-        errors = dashes(frame.vehicle_position, frame.estimate_position, _DASHES, 0.6)
+        errors = dashes(frame.position, frame.position_estimate, _DASHES, 0.6)
         self._lines["errors"].show((errors, np.tile(self._colours, (_DASHES, 1))) if look.estimates else NOTHING)
         circles = level_lines(frame, self._colours, look, _LARGEST * side, self.ground.z + 2e-3 * side)
         self._lines["levels"].show(circles)

@@ -7,7 +7,6 @@
 | `struct_of`, `field_types` | `StructInstance._cls`, `Struct.vars` | fields of a record |
 | `scalar_of` | `_wp_scalar_type_` | the NumPy type of an array of vectors |
 | `cpu_features` | `context._get_cpu_feature_set` | the processor, as LLVM names it |
-| `kernel_hashes` | `context.user_modules`, `Module.get_module_hash` | versions of kernels in a report of a run |
 | `_kernel_source` | `codegen.codegen_kernel`, `Adjoint.args` | no copies of records; no kernels of the host on CUDA |
 | `_function_source` | `codegen.codegen_func`, `codegen.cpu_module_header` | CPU: indices and loops as in C |
 
@@ -182,11 +181,3 @@ def field_types(record: Any) -> dict[str, Any]:
 def scalar_of(kind: Any) -> Any:
     """Return the scalar type of a vector or matrix type; a scalar type is returned unchanged."""
     return getattr(kind, "_wp_scalar_type_", kind)
-
-
-def kernel_hashes() -> dict[str, str]:
-    """Return the hashes of this package's modules of kernels that are loaded, by name."""
-    empty = wp.get_module("coopenv.empty").get_module_hash()
-    modules = [(name, module) for name, module in context.user_modules.items() if name.startswith("coopenv.")]
-    hashes = {name: module.get_module_hash() for name, module in modules}
-    return {name: digest.hex() for name, digest in sorted(hashes.items()) if digest != empty}

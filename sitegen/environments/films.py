@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from coopenv.api.engine import Engine
+from coopenv.episode import Episode, Origin
 from coopenv.runs.films import Shot, space_film, top_view_film, write_film
 from coopenv.runs.scenes import driver_of, scene_of
 from coopenv.scenario import Scenario
-from coopenv.viz.scene import Origin, SceneRecord
 
 FORMATS, MOST_BYTES = ((6.0, 448), (3.0, 320), (3.0, 240)), 280_000
 """Formats of films: pictures a second and width, px; the first within the limit counts, or the last. Limit in bytes."""
@@ -61,8 +61,9 @@ def write_page_films(name: str, scenario: Scenario, folder: Path, on_progress: C
         record = scene_of(engine, source, policy, lambda share: on_progress(share / 2))
     _write_small(lambda width: top_view_film(record, False), path, record, lambda share: on_progress(0.5 + share / 4))
     if scenario.driven and find_spec("pyvista"):
-        longest = int(np.isfinite(record.fields["position_error"]).sum(axis=0).argmax())
-        distance = np.abs(record.fields["position"][..., :2]).max(axis=-1)
+        longest = int(np.isfinite(record["position_error"]).sum(axis=0).argmax())
+        frames = [record.frame(k) for k in range(len(record))]
+        distance = np.abs([frame.target_position[:, :2] for frame in frames]).max(axis=-1)
         near = distance[:, len(scenario.landmarks) + longest] <= 1.1 * np.nanmax(distance[0])  # of all at the start
         inside = record.of(np.flatnonzero(near))
         behind = partial(space_film, [("", inside)], cameras=("follow",), vehicle=longest)
@@ -70,7 +71,7 @@ def write_page_films(name: str, scenario: Scenario, folder: Path, on_progress: C
 
 
 def _write_small(
-    film: Callable[[int], list[list[Shot]]], path: Path, record: SceneRecord, on_progress: Callable[[float], None]
+    film: Callable[[int], list[list[Shot]]], path: Path, record: Episode, on_progress: Callable[[float], None]
 ) -> None:
     """Write the film of a width in the first of the formats that makes no larger file."""
     for fps, width in FORMATS:

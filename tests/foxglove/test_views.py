@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coopenv.cli.app import main
+from coopenv.episode import Episode
 from coopenv.estimation.poses import Coordinates, covariance_in_map
-from coopenv.observers import Run, run
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.observers.recording import Recording
+from coopenv.runs.recorder import record_episode
 from coopenv.scenario.sensing import Camera
 from coopenv.sources.mcap import read_recording, write_recording
+from coopenv.sources.worlds import Replay
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import differences, simulated
 
@@ -61,16 +65,20 @@ def xyz(point: Any) -> list[float]:
     return [point.x, point.y, point.z]
 
 
-def written(recording: Recording, observer: str, path: Path) -> tuple[Run, Log]:
+def estimated(recording: Recording, observer: str) -> Episode:
+    return replace(record_episode(Replay(recording, "log", {"observer.name": observer})), recording=recording)
+
+
+def written(recording: Recording, observer: str, path: Path) -> tuple[Trajectory, Log]:
     from coopenv.foxglove.log_views import views
 
-    result = run(observer, recording)
-    write_recording(recording, path, views=views(recording, result, start=START), start=START)
-    return result, Log(path)
+    episode = estimated(recording, observer)
+    write_recording(recording, path, views=views(episode, start=START), start=START)
+    return episode.trajectory, Log(path)
 
 
 @pytest.fixture(scope="module")
-def crossing(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recording, Run, Log, Path]:
+def crossing(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recording, Trajectory, Log, Path]:
     made = simulated(FOUR_WAY, horizon=2.0, seed=1)
     path = tmp_path_factory.mktemp("log") / "drive.mcap"
     return (made, *written(made, "robust", path), path)
@@ -131,7 +139,7 @@ def test_transforms_are_the_poses(crossing: Any) -> None:
         for i in range(4):
             for name, R, p in (
                 (f"vehicle_{i + 1}", made.truth.rotation[k, i], made.truth.position[k, i]),
-                (f"vehicle_{i + 1}/estimate", result.rotation[k, i], result.position[k, i]),
+                (f"vehicle_{i + 1}/estimate", result.rotation_estimate[k, i], result.position_estimate[k, i]),
             ):
                 q = frames[name].rotation
                 assert frames[name].parent_frame_id == "map"
@@ -160,12 +168,14 @@ def test_estimates_have_the_covariance_in_the_maps_axes(crossing: Any) -> None:
     from coopenv.sources.mcap_format import codec
 
     made, result, log, _ = crossing
-    P = covariance_in_map(result.coordinates, result.rotation, result.position, result.covariance)
+    P = covariance_in_map(Coordinates.RICCATI, result.rotation_estimate, result.position_estimate, result.covariance)
     stated = 0
     for n, data in enumerate(log["/vehicle_3/estimate"]):
         message = codec().deserialize_cdr(data, "geometry_msgs/msg/PoseWithCovarianceStamped")
         found = message.pose.covariance.reshape(6, 6)
-        np.testing.assert_allclose(xyz(message.pose.pose.position), result.position[3 * n, 2], rtol=1e-6, atol=1e-5)
+        np.testing.assert_allclose(
+            xyz(message.pose.pose.position), result.position_estimate[3 * n, 2], rtol=1e-6, atol=1e-5
+        )
         if np.isfinite(P[3 * n, 2]).all():
             np.testing.assert_allclose(found, P[3 * n, 2], rtol=1e-5, atol=1e-9)
             stated += 1
@@ -251,7 +261,7 @@ def test_gain_matrices_are_no_covariances(tmp_path: Path) -> None:
     from coopenv.sources.mcap_format import codec
 
     made, path = simulated("crossing_path", horizon=22.0), tmp_path / "gain.mcap"
-    shown = views(made, run("riccati", made), gain=True)
+    shown = views(estimated(made, "riccati"))
     write_recording(made, path, views=shown)
     log = Log(path)
     assert "/scene/uncertainty" not in log.messages

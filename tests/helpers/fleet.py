@@ -9,7 +9,7 @@ import numpy as np
 
 from coopenv.observers.sensed import Sensed, Truth
 from coopenv.scenario import Scenario
-from coopenv.sources.base import Capabilities, Command, Episode, TickGenerator
+from coopenv.sources.base import Capabilities, Command, TickGenerator, TickStream
 from tests.helpers.builders import landmark, scenario, vehicle
 
 CAMERA, DECISION = 30.0, 10.0
@@ -68,7 +68,7 @@ class Fleet(TickGenerator):
         self.reasons.append(reason)
         super().stop(reason)
 
-    def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
+    def episode(self, seed: int | None, options: Mapping[str, Any]) -> TickStream:
         self._seed, self._number = (self._seed, self._number + 1) if seed is None else (seed, 0)
         rng = np.random.default_rng([self._seed, self._number])
         pose, speed = np.array(STARTS), np.zeros(3)

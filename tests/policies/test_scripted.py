@@ -11,7 +11,7 @@ import coopenv
 from coopenv.api.make import make_rows
 from coopenv.base.errors import CoopenvError
 from coopenv.policies import decide, load_agent, restart
-from coopenv.runs.recorder import drive_vehicles
+from coopenv.runs.exports import drive_vehicles
 from coopenv.scenario import load_scenario
 from tests.helpers.commands import refused
 

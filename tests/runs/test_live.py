@@ -20,12 +20,12 @@ from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.cli.app import main
 from coopenv.cli.options import console
+from coopenv.episode import Episode, Origin
 from coopenv.policies import load_agent
 from coopenv.policies.base import zero_policy
 from coopenv.runs.films import Shot, frames_at, top_view_film, write_film, write_pictures
 from coopenv.runs.live import Keyboard, Keys, drive_by_hand, watch
 from coopenv.runs.scenes import frame_stride, scene_of
-from coopenv.viz.scene import Origin, SceneRecord
 from coopenv.viz.stage import Stage
 from coopenv.viz.topview import PictureWindow, TopView
 from tests.helpers.commands import refused
@@ -178,7 +178,7 @@ def test_mistakes_are_one_line(options: list[str], message: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def record() -> SceneRecord:
+def record() -> Episode:
     scenario = coopenv.load_scenario("overtaking", {"horizon": 1.0})
     return scene_of(Engine(scenario), Origin.of("overtaking", scenario, seed=0))
 
@@ -192,7 +192,7 @@ def test_a_film_shows_the_frame_that_is_there() -> None:
 
 
 @pytest.mark.parametrize("suffix", [".webp", ".gif"])
-def test_a_film_is_the_top_view_in_time(suffix: str, record: SceneRecord, tmp_path: Path) -> None:
+def test_a_film_is_the_top_view_in_time(suffix: str, record: Episode, tmp_path: Path) -> None:
     path = tmp_path / f"film{suffix}"
     assert write_film(top_view_film(record, False), path, fps=5.0, width=448) == 6
     with Image.open(path) as film:
@@ -206,13 +206,13 @@ def test_a_film_is_the_top_view_in_time(suffix: str, record: SceneRecord, tmp_pa
     assert np.abs(shown - wanted).mean() < 8.0
 
 
-def test_films_stand_side_by_side_with_who_is_lost(record: SceneRecord, tmp_path: Path) -> None:
+def test_films_stand_side_by_side_with_who_is_lost(record: Episode, tmp_path: Path) -> None:
     """Both vehicles are placed 3 and 0.1 m off, and 0.1 m each: they are about half a metre long."""
     (size, _), count = Stage(record.scenario).bodies(), len(record)
     assert (size[:, 0] > 0.2).all() and (size[:, 0] < 2.5).all()
     error = {name: np.tile(off, (count, 1)) for name, off in (("one", [3.0, 0.1]), ("none", [0.1, 0.1]))}
     records = {
-        name: SceneRecord(record.scenario, record.source, {**record.fields, "position_error": off})
+        name: Episode(record.scenario, record.source, {**record.rows, "position_error": off})
         for name, off in error.items()
     }
     shots = [[Shot(each, TopView(each.scenario, panel=False), name) for name, each in records.items()]]
@@ -224,7 +224,7 @@ def test_films_stand_side_by_side_with_who_is_lost(record: SceneRecord, tmp_path
     assert left[0] > left[1] + 60.0 and right[1] > right[0] + 60.0  # vermilion, green
 
 
-def test_a_short_row_of_a_film_ends_in_white(record: SceneRecord, tmp_path: Path) -> None:
+def test_a_short_row_of_a_film_ends_in_white(record: Episode, tmp_path: Path) -> None:
     shots = [Shot(record, TopView(record.scenario, panel=False)) for _ in range(3)]
     write_film([shots[:2], shots[2:]], tmp_path / "film.webp", fps=1.0, width=400)
     with Image.open(tmp_path / "film.webp") as film:
@@ -233,14 +233,14 @@ def test_a_short_row_of_a_film_ends_in_white(record: SceneRecord, tmp_path: Path
     assert np.abs(upper[:, :200] - lower[:, :200]).mean() < 4.0 and lower[:, 204:].min() > 240.0
 
 
-def test_mp4_has_every_picture(record: SceneRecord, tmp_path: Path) -> None:
+def test_mp4_has_every_picture(record: Episode, tmp_path: Path) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
     assert write_film(top_view_film(record), tmp_path / "film.mp4", fps=10.0, speed=2.0) == 6
     assert ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] == 6
 
 
 def test_other_formats_and_missing_extras_are_reported(
-    record: SceneRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    record: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(OutputError, match=r"film\.avi: unknown format of a film; known: \.mp4, \.gif, \.webp"):
         write_film(top_view_film(record), tmp_path / "film.avi", fps=10.0)

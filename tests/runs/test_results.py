@@ -18,7 +18,7 @@ from coopenv.cli.app import main
 from coopenv.estimation.metrics import absolute_error, relative_error
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.command import Results
-from coopenv.runs.recorder import write_tum
+from coopenv.runs.exports import write_tum
 from tests.helpers.commands import refused
 from tests.helpers.synthetic import make_trajectory
 

@@ -27,7 +27,7 @@ from coopenv.report.table import Table
 from coopenv.runs import Rollout, rollout
 from coopenv.runs.command import noise_note
 from coopenv.runs.console import COLUMNS, gaps, legend, rates, remarks
-from coopenv.runs.recorder import drive_vehicles
+from coopenv.runs.exports import drive_vehicles
 from coopenv.runs.rollouts import Ending, outcome_line, run_metrics, theory_rates, vehicle_metrics
 from tests.helpers.commands import printed, refused
 from tests.helpers.env_suite import SHIPPED

@@ -20,11 +20,11 @@ import pytest
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
+from coopenv.episode import Origin
 from coopenv.runs.live import FAULTS, EngineReel, Reel, vehicle_index
 from coopenv.runs.scenes import driver_of, scene_of
 from coopenv.runs.view import Viewer
 from coopenv.sources.sources import open_backend
-from coopenv.viz.scene import Origin
 from coopenv.viz.web import free_port, guarded_server
 from tests.helpers.fleet import Fleet
 from tests.helpers.processes import wait_until
@@ -52,7 +52,7 @@ def test_another_observer_sees_the_same_episode() -> None:
     assert [frame.tick for frame in reel.frames] == [frame.tick for frame in before]
     for old, new in zip(before, reel.frames, strict=True):
         np.testing.assert_array_equal(old.position, new.position)
-    assert (before[-1].estimate_position != reel.frames[-1].estimate_position).any()
+    assert (before[-1].position_estimate != reel.frames[-1].position_estimate).any()
     before = reel.frames
     with pytest.raises(CoopenvError, match="unknown observer"):
         reel.change(observer="nobody")
@@ -70,13 +70,13 @@ def test_a_fault_begins_now(fault: str) -> None:
     assert len(reel.frames) == 20
     if "whole episode" not in fault:
         for old, new in zip(before[:-1], reel.frames[:-1], strict=True):
-            np.testing.assert_array_equal(old.estimate_position, new.estimate_position)
+            np.testing.assert_array_equal(old.position_estimate, new.position_estimate)
     run_to(reel, 40)
     wrong = reel.frames[-1]
     reel.change(fault={})
     run_to(reel, 40)
     if "detections" not in fault:  # here every neighbour is always measured
-        assert (wrong.estimate_position != reel.frames[-1].estimate_position).any()
+        assert (wrong.position_estimate != reel.frames[-1].position_estimate).any()
     reel.close()
 
 
@@ -118,7 +118,7 @@ def test_the_user_goes_through_the_episode(viewer: Viewer) -> None:
 def test_switches_change_what_is_shown_and_the_view_goes_along_with_the_picked_vehicle(viewer: Viewer) -> None:
     picture, root = viewer._picture, viewer._picture.ground.root
     wish(viewer, ("play", None), ("seek", 1.0), ("magnification", 1.0), ("vehicle", 2))
-    place = viewer._frame.vehicle_position[2, :2] + root.position[:2]
+    place = viewer._frame.position[2, :2] + root.position[:2]
     np.testing.assert_allclose(place, viewer._stage.middle[:2], atol=1e-3)
     small = np.array(picture.actors._ellipsoids.handle.batched_scales)
     wish(viewer, ("magnification", 10.0), *((f"show {name}", False) for name in ("names", "views", "follow")))
@@ -450,7 +450,7 @@ def test_a_kept_scene_is_shown_and_cannot_be_changed() -> None:
     with guarded_server("127.0.0.1") as (server, _):
         shown = Viewer(server, reel)
         wish(shown, ("seek", 1.0))
-        assert shown._frame.tick == record.fields["tick"][-1]
+        assert shown._frame.tick == record["tick"][-1]
     assert not reel.more()
     with pytest.raises(CoopenvError, match="nothing can be changed"):
         reel.change(observer="robust")

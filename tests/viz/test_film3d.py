@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
+from coopenv.episode import FIELDS, Episode, Frame, Origin
 from coopenv.estimation import Sight
 from coopenv.runs.films import cause_of_loss
 from coopenv.viz.perspective import Lens
-from coopenv.viz.scene import Frame, Origin, SceneRecord
 from coopenv.viz.stage import Stage, entries
 from coopenv.viz.style import vehicle_colour
 
@@ -59,16 +59,16 @@ def hue_around(picture: np.ndarray, place: tuple[int, int], colour: str) -> floa
 def test_cars_and_their_estimates_stand_where_a_pinhole_camera_sees_them(frame: Frame) -> None:
     scenario = coopenv.load_scenario("urban_crossing")
     stage = Stage(scenario)
-    aside = replace(frame, estimate_position=frame.vehicle_position + 3.5 * frame.vehicle_rotation[:, :, 0])
+    aside = replace(frame, position_estimate=frame.position + 3.5 * frame.rotation[:, :, 0])
     aside = replace(aside, position_covariance=1e-6 * np.tile(np.eye(3), (4, 1, 1)))
     with closing(View3d(scenario, SIZE)) as view:
         here, apart = view.paint(frame), view.paint(aside)
     assert here.shape == (360, 480, 3) and here.dtype == np.uint8
     middle = np.array([0.0, 0.0, stage.floor])
     for i in range(stage.vehicles):
-        at = seen_from_above(frame.vehicle_position[i] * [1, 1, 0] + middle, stage)
+        at = seen_from_above(frame.position[i] * [1, 1, 0] + middle, stage)
         assert hue_around(here, at, vehicle_colour(i)) > 0.9, i
-        ghost = seen_from_above(aside.estimate_position[i] * [1, 1, 0] + middle, stage)
+        ghost = seen_from_above(aside.position_estimate[i] * [1, 1, 0] + middle, stage)
         drawn = np.where(apart == here, 128, apart)  # grey where nothing new is drawn
         assert hue_around(drawn, ghost, vehicle_colour(i)) > 0.8, i
 
@@ -93,9 +93,9 @@ def test_a_driver_sees_targets_where_its_camera_images_them(frame: Frame) -> Non
         np.tile(stage.eyes(frame)[0], (len(away), 1)), away, [*stage.buildings, *stage.solid(frame, (stage.landmarks,))]
     )
     target = min(np.flatnonzero((free > 1.0).all(axis=0)), key=lambda i: np.linalg.norm(away[i]))
-    rotation = frame.rotation.copy()
+    rotation = frame.target_rotation.copy()
     rotation[stage.landmarks] = Rotation.from_euler("z", np.arctan2(away[target, 1], away[target, 0]) - 0.2).as_matrix()
-    turned = replace(frame, rotation=rotation)
+    turned = replace(frame, target_rotation=rotation)
     lens = Lens(stage, turned, 0)
     with closing(View3d(scenario, lens.size, "driver", 0)) as view:
         picture = view.paint(turned).astype(float)
@@ -114,17 +114,17 @@ def test_the_pair_camera_shows_both_cars_with_the_line_of_sight_between_them() -
     seen = sight.copy()
     seen[1, leader] = Sight.VISIBLE
     blind, seeing = replace(start, sight=sight), replace(start, sight=seen)
-    place = start.position.copy()
-    place[leader] += 0.5 * start.rotation[leader, :, 0]
+    place = start.target_position.copy()
+    place[leader] += 0.5 * start.target_rotation[leader, :, 0]
     second = start.tick + round(scenario.rates.camera)
     with closing(View3d(scenario, SIZE, "pair", 1)) as view:
         pictures = [view.paint(frame).astype(float) for frame in (blind, seeing)]
-        pixels = [np.array(view.pixel(start.position[i])) for i in (leader, follower)]
-        view.paint(replace(blind, position=place, tick=second))
+        pixels = [np.array(view.pixel(start.target_position[i])) for i in (leader, follower)]
+        view.paint(replace(blind, target_position=place, tick=second))
         slow = view.waits
         place = place.copy()
-        place[leader] += start.rotation[leader, :, 0]
-        view.paint(replace(blind, position=place, tick=second + round(scenario.rates.camera)))
+        place[leader] += start.target_rotation[leader, :, 0]
+        view.paint(replace(blind, target_position=place, tick=second + round(scenario.rates.camera)))
         assert slow and not view.waits  # 0.5 m/s and 1 m/s, of 1 m/s
     for (u, v), i in zip(pixels, (0, 1), strict=True):
         assert 0 < u < SIZE[0] and 0 < v < SIZE[1]
@@ -135,6 +135,10 @@ def test_the_pair_camera_shows_both_cars_with_the_line_of_sight_between_them() -
     assert changed[row - 9 : row + 10, column - 9 : column + 10].max() > 60.0
 
 
+def rows_of(frame: Frame) -> dict[str, list[np.ndarray]]:
+    return {name: [getattr(frame, name)] for name in FIELDS}
+
+
 def test_a_heading_names_the_cause_of_a_loss(frame: Frame) -> None:
     """Metres of error are the drivers' fault where the covariance states them, and else the observer's."""
     scenario, stage = coopenv.load_scenario("urban_crossing"), Stage(coopenv.load_scenario("urban_crossing"))
@@ -142,13 +146,13 @@ def test_a_heading_names_the_cause_of_a_loss(frame: Frame) -> None:
 
     def cause(covariance: float, **source: object) -> str:
         stated = replace(far, position_covariance=covariance * np.tile(np.eye(3), (4, 1, 1)))
-        record = SceneRecord.of_frames(scenario, Origin.of("urban_crossing", scenario, **source), [stated])
+        record = Episode(scenario, Origin.of("urban_crossing", scenario, **source), rows_of(stated))
         return cause_of_loss(record, stage, stated)
 
     assert cause(4.0, policy="peek") == "the drivers see too little"
     assert cause(4.0) == "stated as uncertain"
     assert cause(1.0, policy="peek") == "the observer is wrong"
-    record = SceneRecord.of_frames(scenario, Origin.of("urban_crossing", scenario), [frame])
+    record = Episode(scenario, Origin.of("urban_crossing", scenario), rows_of(frame))
     assert cause_of_loss(record, stage, frame) == "initial estimates"
 
 

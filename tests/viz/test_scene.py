@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import json
-import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -16,18 +14,19 @@ import pytest
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError, DataError
+from coopenv.episode import FIELDS, Episode, Frame, Origin
 from coopenv.estimation import Sight
 from coopenv.policies import decide, load_policy
 from coopenv.runs.scenes import scene_of
 from coopenv.viz.meshes import Look, linear, placed, spacing_of
 from coopenv.viz.perspective import Lens
-from coopenv.viz.scene import Frame, Origin, SceneRecord
 from coopenv.viz.stage import Stage, entries
 from coopenv.viz.topview import TopView
 from coopenv.viz.web import write_replay
 from coopenv.viz.web_panel import GAIN, table_html
 from coopenv.viz.web_picture import FIELD_OF_VIEW, first_camera, first_look, level_lines, levels, stopped
 from tests.helpers.env_suite import ALIKE, each_slow
+from tests.helpers.pages import messages
 
 ALONG = np.array([40.0, 0.0, 0.0])
 
@@ -41,7 +40,7 @@ def played(name: str, overrides: dict[str, Any], decisions: int, seed: int = 1) 
 
 
 @pytest.fixture(scope="module")
-def urban() -> SceneRecord:
+def urban() -> Episode:
     scenario = coopenv.load_scenario("urban_crossing", {"horizon": 3.0})
     return scene_of(Engine(scenario), Origin.of("urban_crossing", scenario, seed=1, policy="zero"))
 
@@ -50,27 +49,28 @@ def test_a_frame_is_what_the_engine_says() -> None:
     engine = played("urban_crossing", {}, 12)
     frame = Frame.of(engine)
     there = engine.view("present")[0] == 1
-    np.testing.assert_array_equal(frame.position[there], engine.view("position")[0][there])
-    assert np.isnan(frame.position[~there]).all()
+    np.testing.assert_array_equal(frame.target_position[there], engine.view("position")[0][there])
+    assert np.isnan(frame.target_position[~there]).all()
     expected = (engine.view("estimate_rotation")[0] @ engine.view("estimate_position")[0][..., None])[..., 0]
     own = there[frame.landmarks :]
-    np.testing.assert_array_equal(frame.estimate_position[own], expected[own])
-    error = np.linalg.norm(frame.vehicle_position - frame.estimate_position, axis=-1)
+    np.testing.assert_array_equal(frame.position_estimate[own], expected[own])
+    error = np.linalg.norm(frame.position - frame.position_estimate, axis=-1)
     np.testing.assert_allclose(error[own], frame.position_error[own], rtol=1e-9)
-    before = frame.position.copy()
+    before = frame.target_position.copy()
     engine.step()
-    np.testing.assert_array_equal(frame.position, before)  # a copy
+    np.testing.assert_array_equal(frame.target_position, before)  # a copy
     variance = np.trace(frame.position_covariance[own], axis1=1, axis2=2)
     assert (frame.three_sigma[own] <= 3.0 * np.sqrt(variance) * (1 + 1e-9)).all()
 
 
-def test_a_scene_comes_back_from_its_file(urban: SceneRecord, tmp_path: Path) -> None:
+def test_a_scene_comes_back_from_its_file(urban: Episode, tmp_path: Path) -> None:
     urban.save(tmp_path / "scene.npz")
-    again = SceneRecord.load(tmp_path / "scene.npz")
+    again = Episode.load(tmp_path / "scene.npz")
     assert (again.source, len(again), again.scenario.title) == (urban.source, len(urban), urban.scenario.title)
     assert again.source.words == "urban_crossing, observer riccati, driven by zero, seed 1" or again.source.honest
-    for name, values in urban.fields.items():
-        np.testing.assert_allclose(again.fields[name], values, rtol=1e-6, atol=1e-30, err_msg=name)
+    for name in FIELDS:
+        values = np.stack([getattr(urban.frame(k), name) for k in range(len(urban))])
+        np.testing.assert_allclose(again[name], values, rtol=1e-6, atol=1e-30, err_msg=name)
     np.testing.assert_array_equal(again.time, urban.time)
     with np.load(tmp_path / "scene.npz") as kept:
         assert len(kept["goal"]) == 1 and len(kept["rotation"]) == len(urban)  # what stands still is kept once
@@ -111,11 +111,11 @@ def edited(path: Path, to: Path, **changes: Any) -> Path:
     ],
 )
 def test_a_file_that_is_no_scene_is_refused(
-    urban: SceneRecord, tmp_path: Path, changes: dict[str, Any], message: str
+    urban: Episode, tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:
     urban.save(tmp_path / "scene.npz")
     with pytest.raises(CoopenvError) as error:
-        SceneRecord.load(edited(tmp_path / "scene.npz", tmp_path / "edited.npz", **changes))
+        Episode.load(edited(tmp_path / "scene.npz", tmp_path / "edited.npz", **changes))
     assert message in str(error.value) and "\n" not in str(error.value)
     assert "edited.npz" in str(error.value)
 
@@ -124,9 +124,9 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
     for content in (b"", b"PK no archive", b"x" * 1000):
         (tmp_path / "scene.npz").write_bytes(content)
         with pytest.raises(DataError, match="not a readable scene"):
-            SceneRecord.load(tmp_path / "scene.npz")
+            Episode.load(tmp_path / "scene.npz")
     with pytest.raises(DataError, match="No such file"):
-        SceneRecord.load(tmp_path / "none.npz")
+        Episode.load(tmp_path / "none.npz")
 
 
 @pytest.mark.parametrize("name", ["behind_truck", "large_crossing", "urban_crossing"])
@@ -181,27 +181,14 @@ def test_targets_are_projected_to_where_cameras_measure_them() -> None:
     assert seen
 
 
-def scene(name: str, **overrides: Any) -> SceneRecord:
+def scene(name: str, **overrides: Any) -> Episode:
     scenario = coopenv.load_scenario(name, {"horizon": 4.0, **overrides})
     return scene_of(Engine(scenario), Origin.of(name, scenario, seed=1))
 
 
 @pytest.fixture(scope="module")
-def overtaking() -> SceneRecord:
+def overtaking() -> Episode:
     return scene("overtaking", horizon=0.5)
-
-
-def messages(page: str) -> tuple[float, list[tuple[float, dict[str, Any]]]]:
-    """Return the length of the recording in a page, s, and its messages with their times."""
-    msgspec = pytest.importorskip("msgspec", reason="needs the extra view")
-    zstandard = pytest.importorskip("zstandard", reason="needs the extra view")
-    found = re.search(r'__VISER_EMBED_DATA__="([^"]+)"', page)
-    assert found
-    packed = base64.b64decode(found[1])
-    inner = zstandard.ZstdDecompressor().decompress(packed[8:], max_output_size=int.from_bytes(packed[:8], "little"))
-    length = int.from_bytes(inner[:8], "little")
-    content = msgspec.msgpack.decode(inner[8 : 8 + length])
-    return content["durationSeconds"], content["messages"]
 
 
 def test_names_of_vehicles_that_are_close_stand_above_each_other() -> None:
@@ -276,13 +263,13 @@ def test_small_ellipsoids_are_magnified() -> None:
     assert first_look(np.array([2e-4]), stage, source.model_copy(update={"honest": False})).magnification == 1.0
 
 
-def test_circles_of_protection_levels(overtaking: SceneRecord) -> None:
+def test_circles_of_protection_levels(overtaking: Episode) -> None:
     """Of the picked vehicle, or of all; neither unknown levels nor circles beyond the scene are drawn."""
     frame = overtaking.frame(len(overtaking) - 1)
-    n = len(frame.estimate_position)
+    n = len(frame.position_estimate)
     level = np.full((n, 2), np.inf)
     level[0], level[1] = (2.0, 0.1), (1e3, 0.1)
-    frame = replace(frame, protection_level=level, estimate_position=np.arange(3.0 * n).reshape(n, 3))
+    frame = replace(frame, protection_level=level, position_estimate=np.arange(3.0 * n).reshape(n, 3))
     colours = np.arange(3 * n, dtype=np.uint8).reshape(n, 3)
     for look in (Look(picked=0), Look(levels=True)):
         points, shades = level_lines(frame, colours, look, 50.0, 0.5)
@@ -292,9 +279,9 @@ def test_circles_of_protection_levels(overtaking: SceneRecord) -> None:
     assert not len(level_lines(frame, colours, Look(), 50.0, 0.5)[0])
 
 
-def test_table_with_protection_levels(overtaking: SceneRecord) -> None:
+def test_table_with_protection_levels(overtaking: Episode) -> None:
     frame = overtaking.frame(0)
-    level = np.full((len(frame.estimate_position), 2), np.inf)
+    level = np.full((len(frame.position_estimate), 2), np.inf)
     assert "level" not in table_html(overtaking.source, replace(frame, protection_level=level))
     level[0] = 1.25, 0.1
     text = table_html(overtaking.source, replace(frame, protection_level=level))

@@ -20,11 +20,11 @@ from matplotlib.colors import to_rgb
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.format import fixed
+from coopenv.episode import Frame
 from coopenv.estimation import Sight
 from coopenv.scenario import load_scenario
 from coopenv.scenario.sensing import Camera
 from coopenv.viz.perspective import Lens, _before, camera_image, pixels
-from coopenv.viz.scene import Frame
 from coopenv.viz.stage import Box, Stage, camera_fan, ellipses, free_lengths, limits
 from coopenv.viz.style import ORANGE, vehicle_colour
 from coopenv.viz.topview import TopView
@@ -259,7 +259,7 @@ def test_show_without_a_display_is_silent() -> None:
     """With each setting of Matplotlib's backend, in forks of one interpreter in which Matplotlib is not loaded yet."""
     script = (
         "import os, sys\n"
-        "import coopenv.scenario.files, coopenv.estimation, coopenv.viz.scene\n"
+        "import coopenv.scenario.files, coopenv.estimation, coopenv.episode\n"
         "assert 'matplotlib' not in sys.modules\n"
         "for backend in (None, 'tkagg', 'module://no_such_backend'):\n"
         "    if os.fork() == 0: break\n"

@@ -17,9 +17,10 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.format import fixed
 from coopenv.bench.executors import Executor
 from coopenv.bench.observers.sources import RecordSource
+from coopenv.episode import Views
 from coopenv.estimation import UNIFORM_ROTATION
 from coopenv.estimation.metrics import CONVERGED, SETTLED, Interval, settling_time, wilson_interval
-from coopenv.evaluation.episodes import Views, play
+from coopenv.evaluation.episodes import play
 from coopenv.observers.contract import Factory
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import portable

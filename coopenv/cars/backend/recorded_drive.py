@@ -30,7 +30,7 @@ from coopenv.cars.settings.profile import STOPPED_TOPIC, TICK_TOPIC, presence_of
 from coopenv.scenario import parse_scenario
 from coopenv.scenario.files import override
 from coopenv.scenario.own_terms import without_own_terms
-from coopenv.sources.base import Capabilities, Episode, TickGenerator
+from coopenv.sources.base import Capabilities, TickGenerator, TickStream
 from coopenv.sources.mcap_format import CUT_OFF, RosLog, codec, reading
 
 FORMAT = "coopenv drive 1"
@@ -221,7 +221,7 @@ class Drive(TickGenerator):
         deployment = parse_deployment(given, Path(self._where))
         return deployment, bind(scenario, deployment.cars, deployment.markers, self._where, only, deployment.profile)
 
-    def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
+    def episode(self, seed: int | None, options: Mapping[str, Any]) -> TickStream:
         """Go through the messages from the begin, yielding the ticks of one episode; `arm` has no effect."""
         reset_options(options)
         wanted, self._next = self._next, (self._next + 1) % self._episodes

@@ -24,7 +24,7 @@ from coopenv.cars.messages.readings import CarPose, Sample
 from coopenv.cars.settings.profile import Role
 from coopenv.estimation.poses import MISFIT_DEG
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.sources.base import Capabilities, Episode, TickGenerator
+from coopenv.sources.base import Capabilities, TickGenerator, TickStream
 from coopenv.sources.selection import WHOLE, Selection
 from coopenv.sources.worlds import without_robots
 
@@ -200,7 +200,7 @@ class Bag(TickGenerator):
             counts = [f"{number} ({count} times)" for number, count in sorted(others.items())]
             yield f"detected markers that are not in the map: {listed(counts)}"
 
-    def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
+    def episode(self, seed: int | None, options: Mapping[str, Any]) -> TickStream:
         """Go through the bags tick by tick; the option `arm` has no effect."""
         reset_options(options)
         assembler, samples, following = Assembler(self.binding), sorted(self.log.samples, key=_used), 0
