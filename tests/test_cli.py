@@ -156,7 +156,7 @@ def test_run_writes_its_files_and_prints_its_table(capsys: pytest.CaptureFixture
     errors, rates = (line.split() for line in out.splitlines() if line.startswith("vehicle_1 "))
     assert [float(x) for x in errors[1:5]] == pytest.approx([11.5, 90.0, 1.32, 2.93], rel=0.01)
     assert [float(x) for x in rates[1:]] == [
-        pytest.approx(metrics["vehicles"][0][key], rel=0.006) for key in console.RATE_COLUMNS
+        pytest.approx(metrics["vehicles"][0][column.name], rel=0.006) for column in console.RATES[1:]
     ]
     assert "vehicle_5: not observable at 0-" in out
     assert "No steady state: it would begin at 35 s" in out

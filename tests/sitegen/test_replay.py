@@ -23,14 +23,13 @@ def test_the_home_page_replays_what_a_run_gives() -> None:
         whole = np.frombuffer(base64.b64decode(text), "<i2").astype(float)
         return (whole * data["step"]).reshape(data["frames"], n, width)[:count]
 
-    fields = record.fields
     truth, estimate = numbers(data["truth"], 3), numbers(data["variants"]["riccati/0"]["estimate"], 6)
     assert data["frames"] / data["rate"] == pytest.approx(replay.LENGTH, abs=0.2)
-    np.testing.assert_allclose(truth[..., :2], fields["position"][:, -n:, :2], atol=0.03)
-    np.testing.assert_allclose(estimate[..., :2], fields["estimate_position"][..., :2], atol=0.1)
-    R = fields["estimate_rotation"]  # no vehicle is drawn otherwise than it stands
+    np.testing.assert_allclose(truth[..., :2], record["target_position"][:, -n:, :2], atol=0.03)
+    np.testing.assert_allclose(estimate[..., :2], record["position_estimate"][..., :2], atol=0.1)
+    R = record["rotation_estimate"]  # no vehicle is drawn otherwise than it stands
     np.testing.assert_allclose(np.cos(estimate[..., 2]), R[..., 0, 0] / np.hypot(R[..., 0, 0], R[..., 1, 0]), atol=0.05)
     lost = numbers(data["variants"]["riccati/0"]["lost"], 1)[..., 0] > 0
     length = 0.042 * data["side"]  # of a vehicle without a body
-    clear = np.abs(fields["position_error"] - length) > 0.1
-    np.testing.assert_array_equal(lost[clear], (fields["position_error"] > length)[clear])
+    clear = np.abs(record["position_error"] - length) > 0.1
+    np.testing.assert_array_equal(lost[clear], (record["position_error"] > length)[clear])
