@@ -24,7 +24,7 @@ DRIVERS = ("route_follower", "peek")
 """A driver that looks straight ahead, and one that plans its view."""
 TEAM_DRIVERS = ("look_ahead", "team_look_ahead")
 """A driver that plans for itself, and one that plans for the fleet."""
-MADE_BY = "coopenv page"
+MADE_BY = "python -m sitegen.environments"
 """Command that pages name; the pages of the project still name that of version 0.9."""
 SHOWN = ("mean", "ci_low", "ci_high")
 KEYS = ("sensing", "agent", "metric", *SHOWN, "n")
