@@ -40,14 +40,14 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-Kind = StrEnum("Kind", "envs observers agents variants scenes")
+Kind = StrEnum("Kind", "envs observers agents variants scenes sources")
 
 
 @app.command("list", rich_help_panel=LOOK)
 def list_command(
     kind: Annotated[Kind, typer.Argument(help="What to list.")] = Kind.envs, as_json: options.AsJson = False
 ) -> None:
-    """List environments, observers, agents, variants or scenes."""
+    """List environments, observers, agents, variants, scenes or sources."""
     from coopenv.runs import summary
 
     if kind is Kind.variants:

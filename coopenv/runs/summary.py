@@ -23,6 +23,7 @@ from coopenv.runs.scenario_text import settings, text_table
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.scenes import scene_rows
 from coopenv.scenario.sensing import Noise
+from coopenv.sources.registry import ENVIRONMENT, LOG, kinds
 
 DESCRIPTION_LENGTH = 240  # characters of a scenario's description on the first screen
 
@@ -256,6 +257,7 @@ COLUMNS = {
     "agents": ("name", "kind", "about"),
     "variants": ("name", "of", "about"),
     "scenes": ("name", "options", "about"),
+    "sources": ("name", "ticks", "about"),
 }
 """Columns of the rows that the tables show."""
 
@@ -284,10 +286,24 @@ def list_rows(kind: str) -> Sequence[Mapping[str, Any]]:
         return [{"name": name, "about": description(name)} for name in list_observers()]
     if kind == "scenes":
         return scene_rows()
+    if kind == "sources":
+        return source_rows()
     agents = map(find_agent, list_agents())
     return [
         {"name": a.name, "kind": a.kind, "environments": list(a.environments), "about": _sentence(a.description)}
         for a in agents
+    ]
+
+
+def source_rows() -> list[dict[str, Any]]:
+    """Return a row per kind of source, of this package, its guests and installed packages."""
+    return [
+        {
+            "name": name,
+            "ticks": "recorded" if row.recorded else "live",
+            "about": f"{row.title}: {row.example}" if row.example else row.title,
+        }
+        for name, row in {"environment": ENVIRONMENT, "log": LOG, **kinds()}.items()
     ]
 
 

@@ -103,9 +103,8 @@ def read_value_of_sensing(path: Path) -> dict[str, Any] | None:
         value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         if "text" not in value:
             _rows(value)
-        return {key: value[key] for key in ("coopenv", "worlds", "scenario", "text" if "text" in value else "rows")} | {
-            "score": value.get("score", 1)
-        }
+        kept = {key: value[key] for key in ("coopenv", "worlds", "scenario", "text" if "text" in value else "rows")}
+        return {**kept, "score": value.get("score", SCORE if "text" in value else 1)}
     except (OSError, ValueError, KeyError, TypeError) as error:
         why = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise CoopenvError(f"{path}: no figures of a page ({why}); --measure makes them anew") from None
@@ -113,9 +112,9 @@ def read_value_of_sensing(path: Path) -> dict[str, Any] | None:
 
 def value_of_sensing_text(environment: str, scenario: Scenario, value: Mapping[str, Any]) -> str:
     """Return the figures in Markdown, with the commands that give them; `text` is what a benchmark has written."""
-    changed = value["scenario"] != fingerprint(scenario)
+    changed = value["scenario"] != fingerprint(scenario) or value["score"] != SCORE
     if "text" in value:
-        note = "*The environment has changed since these figures were measured.*\n\n" if changed else ""
+        note = "*The environment or the score has changed since these figures were measured.*\n\n" if changed else ""
         return f"{note}{value['text']}"
     rows = _rows(value)
     settings = {how for how, _ in rows}
@@ -131,7 +130,6 @@ def value_of_sensing_text(environment: str, scenario: Scenario, value: Mapping[s
         drivers=studied(environment, scenario)[0],
         table=figures_table(("setting" if team or shared else "sensing", "agent"), rows.items(), OVERVIEW),
         worlds=value["worlds"],
-        score=value.get("score", 1),
         coopenv=value["coopenv"],
         changed=changed,
         made_by=MADE_BY,

@@ -151,7 +151,7 @@ def made_up_value_of_sensing(scenario: Scenario) -> dict[str, object]:
         {"sensing": how, "agent": who, "metric": metric, "mean": 0.5, "ci_low": 0.25, "ci_high": 0.75, "n": 2}
         for how, who, metric in product(SETTINGS, DRIVERS, OVERVIEW)
     ]
-    return {"coopenv": "1.2.3", "worlds": 2, "scenario": fingerprint(scenario), "rows": rows}
+    return {"coopenv": "1.2.3", "worlds": 2, "score": 2, "scenario": fingerprint(scenario), "rows": rows}
 
 
 def test_figures_of_cooperation_stand_where_several_vehicles_drive() -> None:
@@ -167,6 +167,7 @@ def test_figures_that_are_older_than_the_environment_are_marked() -> None:
     for changes, marked in (({}, False), ({"title": "Another"}, False), ({"camera.range": 5.0}, True)):
         text = value_of_sensing_text("facade", load_scenario("facade", changes), value)
         assert ("has changed since" in text) == marked and "| sensed | peek | 50 [25, 75] |" in text
+    assert "has changed since" in value_of_sensing_text("facade", load_scenario("facade"), value | {"score": 1})
 
 
 @pytest.mark.parametrize(
