@@ -80,13 +80,13 @@ def test_a_source_that_does_not_work_is_one_line(name: str, options: dict[str, A
 
 
 @pytest.mark.usefixtures("twin")
-@pytest.mark.usefixtures("twin")
 def test_sources_are_listed_with_those_of_other_packages(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "sources", "--json"]) == 0
     names = {row["name"]: row["ticks"] for row in json.loads(capsys.readouterr().out)}
     assert {"environment": "live", "log": "recorded", "mrclam": "recorded", "twin": "live"}.items() <= names.items()
 
 
+@pytest.mark.usefixtures("twin")
 def test_a_live_source_is_no_batch_of_worlds() -> None:
     with pytest.raises(CoopenvError, match="'twin' is a twin, which is one world: open it with parallel_env"):
         open_simulation("twin")
