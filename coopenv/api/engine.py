@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.api.arguments import RewardFunction, Step, check_function, reward_of
-from coopenv.api.plugins import PlugIns
+from coopenv.api.host_observers import PlugIns
 from coopenv.api.terms.layout import observation_layout
 from coopenv.api.terms.own import OwnTerms
 from coopenv.api.terms.results import MEMORY, results_struct, results_table, step_results, team_results

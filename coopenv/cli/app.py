@@ -21,9 +21,10 @@ from coopenv.base.installation import install_command
 from coopenv.base.installation import version as installed_version
 from coopenv.cli import commands, options
 from coopenv.cli.bench import bench, bench_observers
+from coopenv.cli.evaluate import evaluate
 from coopenv.cli.plugins import Extended
 from coopenv.cli.run import export, figures, record, run
-from coopenv.cli.train import dataset, evaluate, train
+from coopenv.cli.train import dataset, train
 from coopenv.cli.view import film, play, view, watch
 
 UsageError: Any = typer.BadParameter.__base__  # raised for every mistake in the options; it has no public name

@@ -1,4 +1,7 @@
-"""Simple drivers to compare with: at constant speed, by the car ahead, waiting when lost, or turning to landmarks."""
+"""Simple drivers: at constant speed, by the car ahead, waiting when lost, or turning to landmarks.
+
+The baseline is in route_follower.py.
+"""
 
 from functools import partial
 

@@ -1,4 +1,4 @@
-"""Episodes recorded with what vehicles measure: the recordings of logs and of comparisons."""
+"""Episodes recorded with what vehicles measure, for logs (`coopenv.sources.mcap` writes them) and comparisons."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,8 @@
 """Terms of observations, rewards and ends of episodes; a row each.
 
 A row describes a term and names the function that computes it. From the rows come the layout of an observation, the
-weights that a scenario may set, the kernel (`coopenv.api.terms`), and the tables of `coopenv describe`.
+weights that a scenario may set (`coopenv.scenario.task`), the kernel (`coopenv.api.terms`), and the tables of
+`coopenv describe`.
 """
 
 from collections.abc import Callable, Iterable, Mapping

@@ -170,7 +170,7 @@ def send_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int, 
 
 
 HOST = Embedded("host", estimate_nothing, start_nothing, send_nothing)
-"""Placeholder for an observer that runs on the host (`coopenv.api.plugins.PlugIns`)."""
+"""Placeholder for an observer that runs on the host (`coopenv.api.host_observers.PlugIns`)."""
 
 
 @device_function

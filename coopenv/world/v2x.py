@@ -1,5 +1,7 @@
 """V2X: pose estimates travel with delay, period, loss and limited range; faults change the messages.
 
+Messages of observers on the host are `coopenv.observers.contract.Message`; here is when they arrive.
+
 Faults of computers, clocks, maps and messages are drawn at a reset. With all of them off, nothing is drawn and nothing
 is changed. Besides the time of sending, a message has two times: its content's (`content_tick`, earlier where the
 sender replays) and its time stamp (`stamp`), wrong by the clocks' offsets.

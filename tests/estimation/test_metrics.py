@@ -158,7 +158,7 @@ def test_rate_fit_starts_after_the_last_excursion() -> None:
     ("error", "remark"),
     [
         (np.append(9.0, np.full(99, 0.01)), "error fell below half within 1 tick"),
-        (np.concatenate([np.full(40, 9.0), np.full(60, 0.01)]), "error fell from half to the noise floor within 1"),
+        (np.repeat([9.0, 0.01], [40, 60]), "error fell from half to the noise floor within 1 tick"),
         (np.full(100, 4.0), "error ends at 100 % of its initial value"),
         (np.append(1e-15, np.full(99, 3.0)), "error ends above its initial value"),
         (np.append(9.0, np.full(99, 3.0)), "error ends at 33 % of its initial value"),

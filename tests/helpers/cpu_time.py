@@ -22,7 +22,7 @@ SHOWN = 40
 LIMITS = {
     "observers": 0.30,
     "bench": 0.28,
-    "cars": 0.26,
+    "cars": 0.31,
     "api": 0.20,
     ".": 0.20,
     "world": 0.18,

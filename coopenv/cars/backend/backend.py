@@ -19,9 +19,9 @@ from coopenv.cars.backend.station import UNTRIED, Gates, Pacer, Station
 from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog, bearing_nis, since
 from coopenv.cars.bags.turning import TurnMonitor
 from coopenv.cars.gate.wheel_command import MotionCommand
+from coopenv.cars.link.connect import open_transport
 from coopenv.cars.link.keys import Signer, Verifier, load_keys
 from coopenv.cars.link.transport import ReceivingTransport, Transport
-from coopenv.cars.link.zenoh import open_transport
 from coopenv.cars.messages.codec import encode, make, warm_up
 from coopenv.cars.messages.readings import Sample
 from coopenv.cars.messages.v2x import estimate_message, report_message

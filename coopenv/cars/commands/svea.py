@@ -117,7 +117,7 @@ def fake(
     from coopenv.base import interrupts
     from coopenv.cars.fake.fleet import prepare_fake, run
     from coopenv.cars.fake.settings import fake_fault
-    from coopenv.cars.link.zenoh import open_transport
+    from coopenv.cars.link.connect import open_transport
     from coopenv.cars.settings.deployment import load_deployment
 
     faults = [fake_fault(text) for text in fault or ()]
@@ -170,7 +170,7 @@ def gate(
     from coopenv.base import interrupts
     from coopenv.cars.gate.process import gate_deployment, prepare_gate, run
     from coopenv.cars.link.clock import CLOCK
-    from coopenv.cars.link.zenoh import open_transport
+    from coopenv.cars.link.connect import open_transport
 
     bounds = {"speed": max_speed, "steering": max_steering, "acceleration": max_acceleration}
     fleet = gate_deployment(car, deployment, connect, off_board)
@@ -211,9 +211,9 @@ def health(
     from coopenv.cars.backend.station import BYPASSED, UNTRIED, Gates, neutral_command
     from coopenv.cars.gate.gate import Reason
     from coopenv.cars.gate.process import gate_deployment
+    from coopenv.cars.link.connect import open_transport
     from coopenv.cars.link.keys import load_verifier
     from coopenv.cars.link.transport import UNIX, LinkError
-    from coopenv.cars.link.zenoh import open_transport
     from coopenv.cars.settings.deployment import load_deployment
 
     fleet = gate_deployment(car, deployment, connect, off_board)
@@ -290,7 +290,7 @@ def see(
     """
     from coopenv.base import interrupts
     from coopenv.cars.gate.process import gate_deployment
-    from coopenv.cars.link.zenoh import open_transport
+    from coopenv.cars.link.connect import open_transport
     from coopenv.cars.messages.readings import read
     from coopenv.cars.messages.see import FrameReader
     from coopenv.cars.messages.vision import Calibration, opencv

@@ -17,9 +17,10 @@ from coopenv.base.errors import CoopenvError, listed
 from coopenv.cars.backend.station import OLD, OPEN, PATIENCE, Gates
 from coopenv.cars.gate.gate import Reason
 from coopenv.cars.gate.wheel_command import MotionCommand, write_drive
+from coopenv.cars.link.connect import certificates_of
 from coopenv.cars.link.keys import Signer, library, load_verifier
 from coopenv.cars.link.transport import Arrival
-from coopenv.cars.link.zenoh import Zenoh, certificates_of, open_zenoh
+from coopenv.cars.link.zenoh import Zenoh, open_zenoh
 from coopenv.cars.messages.cdr import ENCAPSULATION
 from coopenv.cars.messages.codec import decode, encode, header, make, ros2
 from coopenv.cars.messages.readings import Twist, read

@@ -16,9 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.cars.link import transport
+from coopenv.cars.link.connect import open_transport
 from coopenv.cars.link.nats import MOST_WAITING, Letter, Outbox, open_nats, subject_of, subjects_of
 from coopenv.cars.link.transport import LEASE, MOST_PRESENT, HeartbeatTransport, LinkError, matcher
-from coopenv.cars.link.zenoh import open_transport
 from coopenv.cars.messages.codec import encode, make
 from coopenv.cars.settings.deployment import parse_deployment
 from coopenv.cars.settings.profile import SVEA, Role

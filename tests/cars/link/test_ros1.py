@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.link import ros1
+from coopenv.cars.link.connect import open_transport
 from coopenv.cars.link.ros1 import ENVELOPE, open_ros1, opened, sealed
 from coopenv.cars.link.transport import Address, LinkError
-from coopenv.cars.link.zenoh import open_transport
 from coopenv.cars.messages.codec import decode, encode, header, make
 from coopenv.cars.messages.codec import ros1 as types_of_ros1
 from coopenv.cars.settings.deployment import parse_deployment

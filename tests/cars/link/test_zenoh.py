@@ -16,8 +16,9 @@ from pathlib import Path
 import pytest
 
 from coopenv.base.errors import CoopenvError
+from coopenv.cars.link.connect import open_transport
 from coopenv.cars.link.transport import Address, Arrival, LinkError, address_of
-from coopenv.cars.link.zenoh import Zenoh, open_transport, open_zenoh
+from coopenv.cars.link.zenoh import Zenoh, open_zenoh
 from coopenv.cars.settings.deployment import Deployment, DeploymentError, parse_deployment
 from tests.helpers.brokers import Authority
 from tests.helpers.processes import wait_until
