@@ -156,15 +156,16 @@ RECORDED = (
     *("velocity", "angular_velocity", "covariance", "present"),
 )
 """Fields of an engine that an episode is made of: of frames; of all targets velocities and presence; P of vehicles."""
-_SELDOM = frozenset(
-    ("ended", "goal", "route", "route_count", "route_drawn", "traffic_half", "present", "inbox_tick", "pan")
-)
+_UNCHANGED = ("goal", "route", "route_count", "route_drawn", "traffic_half", "present", "inbox_tick", "pan")
+_SELDOM = frozenset(("ended", *_UNCHANGED))
 """Fields that are mostly as at the tick before; a record then holds them once."""
+OF_TRAJECTORY = tuple(name for name in RECORDED if not name.startswith("traffic") and name not in _UNCHANGED)
+"""Fields of `RECORDED` that a `Trajectory` and the ends of its vehicles are made of, without pictures."""
 
 
-def _in_map(row: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return fields of an engine by their names in an episode, the estimated positions in the map frame."""
-    named = {_NAMES.get(name, name): array for name, array in row.items()}
+def _in_map(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return fields of an engine, of a tick or (K, ...), by their names in an episode, estimates in the map frame."""
+    named = {_NAMES.get(name, name): array for name, array in fields.items()}
     named["position_estimate"] = (named["rotation_estimate"] @ named["position_estimate"][..., None])[..., 0]
     return named
 
@@ -346,16 +347,23 @@ class Views:
         """Begin with no tick; an episode needs those of `RECORDED`."""
         self._shown = shown
         self._rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
+        self._often = [(name, rows) for name, rows in self._rows.items() if name not in _SELDOM]
+        self._seldom = [(name, rows) for name, rows in self._rows.items() if name in _SELDOM]
+        self._contents: dict[str, tuple[int, bytes]] = {}
         self.taken = 0
         """Number of ticks."""
 
     def take(self) -> None:
         """Copy the fields as they are now."""
-        for name, rows in self._rows.items():
-            del rows[self.taken :]
-            row = self._shown.view(name).copy()
-            same = name in _SELDOM and rows and row.tobytes() == rows[-1].tobytes()
-            rows.append(rows[-1] if same else row)
+        view, contents = self._shown.view, self._contents
+        for name, rows in self._often:
+            rows[self.taken :] = [view(name).copy()]
+        for name, rows in self._seldom:
+            row = view(name)
+            content = row.tobytes()
+            same = contents.get(name) == (self.taken - 1, content)
+            rows[self.taken :] = [rows[self.taken - 1] if same else row.copy()]
+            contents[name] = self.taken, content
         self.taken += 1
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -364,6 +372,6 @@ class Views:
 
     def episode(self, scenario: Scenario, source: Origin) -> Episode:
         """Return the episode of the first world so far, of at least one tick."""
-        ticks = range(self.taken)
-        rows = [_in_map({name: fields[k][0] for name, fields in self._rows.items()}) for k in ticks]
-        return Episode(scenario, source, {name: [row[name] for row in rows] for name in rows[0]})
+        first = {name: [row[0] for row in rows[: self.taken]] for name, rows in self._rows.items()}
+        poses = {VIEWS[name]: self[VIEWS[name]][:, 0] for name in ("rotation_estimate", "position_estimate")}
+        return Episode(scenario, source, _in_map({**first, **poses}))

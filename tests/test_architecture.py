@@ -105,14 +105,16 @@ def test_a_class_name_means_one_class() -> None:
     assert not sorted({name for name in names if names.count(name) > 1})
 
 
-CORE_LINES = 50_750
-"""Physical lines that the core, without guests, may have at most; the owner alone raises it."""
+CORE_LINES = 48_000
+"""Physical lines that the core, without guests, is to have at most; the owner alone raises it."""
+STILL_ABOVE = 2_750
+"""Lines by which the core may exceed its ceiling for now; this number only falls, to 0."""
 
 
 def test_the_core_keeps_below_its_ceiling() -> None:
     core = {path for path in MODULES.values() if path.relative_to(PACKAGE).parts[0] not in GUESTS}
     lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in core)
-    assert lines <= CORE_LINES, f"{lines} lines; python -m benchmarks.lines shows where they went"
+    assert lines <= CORE_LINES + STILL_ABOVE, f"{lines} lines; python -m benchmarks.lines shows where they went"
 
 
 def test_numbers_of_robust_keep_their_budget() -> None:

@@ -157,8 +157,8 @@ COLUMNS = {
 """Metric, its heading, and the factor to the heading's unit."""
 EXPLANATIONS = {
     "intervals": "95 %, bootstrap over worlds",
-    "e50, e95": "median and 95th percentile of the error from 3 s on, of vehicles under way",
-    "lost": f"collided or never arrived: {LOST:g} m for the rest of the way, more than which no error counts",
+    "e50, e95": "median and 95th percentile of the error from 3 s on",
+    "lost": f"collided or never arrived: {LOST:g} m for the rest of the way; larger errors count as {LOST:g} m",
     "score": f"e95 [cm] of the fleet; rankings go by losses in steps of {100 * LOSSES:g} %, then by the score",
     "few": "share of the time from 3 s on with fewer than three targets in view",
     "return": "sum of the rewards of a vehicle",

@@ -172,7 +172,7 @@ def _interval(figure: Any, factor: float, digits: int) -> str:
 class DatasetOptions:
     """Options of `coopenv dataset`."""
 
-    environment: options.Environment
+    environment: options.Source
     policy: Annotated[
         str,
         typer.Option(
@@ -200,21 +200,32 @@ def dataset(given: DatasetOptions) -> None:
     """Write episodes of a policy as a Minari dataset, one per vehicle."""
     environment, policy, log = given.environment, given.policy, options.console(stderr=True)
     changes = options.parse_overrides(given.overrides)
-    name, scenario = Path(environment).stem, options.load(environment, changes)
     from coopenv.api.registration import registered_spec
+    from coopenv.episode import RECORDED
     from coopenv.policies import load_policy
     from coopenv.runs.console import Progress, compile_notice
-    from coopenv.runs.exports import dataset_place, drive_vehicles, write_dataset
+    from coopenv.runs.exports import STEPS, dataset_place, drive_vehicles, vehicle_episodes, write_dataset
+    from coopenv.runs.recorder import record_episode
+    from coopenv.sources.sources import open_backend
 
-    driver = load_policy(policy, scenario, given.seed)
-    own = Path(policy.rpartition(":")[2] or policy).name
-    identity = given.identity or f"coopenv/{name}/{own}-v0"
+    backend = open_backend(environment, None, changes)
+    scenario, recorded = backend.scenario, backend.capabilities.recorded
+    if recorded:
+        commands.refuse(given, ("policy", "worlds", "seed"), "recorded data have one world and no driver")
+    driver = None if recorded else load_policy(policy, scenario, given.seed)
+    spec = None if recorded else registered_spec(environment, changes)
+    own = "recorded" if recorded else Path(policy.rpartition(":")[2] or policy).name
+    identity = given.identity or f"coopenv/{Path(environment).stem}/{own}-v0"
     place = dataset_place(identity, given.out, given.force)
-    with Progress(log, "driving", total=1.0) as progress, compile_notice(log):
-        episodes = drive_vehicles(scenario, driver, given.seed, given.worlds, progress.update)
+    with Progress(log, "replaying" if recorded else "driving", total=1.0) as progress, compile_notice(log):
+        if driver is None:
+            fields = (*RECORDED, *STEPS)
+            episodes = vehicle_episodes(record_episode(backend, on_progress=progress.update, fields=fields))
+        else:
+            episodes = drive_vehicles(scenario, driver, given.seed, given.worlds, progress.update)
     again = commands.command_text("dataset", given, ("identity", "out", "force"))
     facts = {"algorithm_name": own, "description": f"{scenario.title}: {again}"}
-    write_dataset(episodes, scenario, registered_spec(environment, changes), place, identity, facts)
+    write_dataset(episodes, scenario, spec, place, identity, facts)
     steps = sum(len(episode.actions) for episode in episodes)
     size = f"{len(episodes)} episodes, {steps:,} steps"
     options.console().print(f"{place.parent}: {size}, minari.load_dataset('{identity}')", soft_wrap=True)

@@ -1,7 +1,7 @@
 """A tidy table: columns with name, title, unit and format, and a value of each in every row.
 
-`print` of a console shows it; `csv`, `markdown`, `latex` and `html` return it as text, `Tabular` gives it to other
-programs.
+`print` of a console shows it, and a notebook shows it as HTML; `csv`, `markdown` and `latex` return it as text, and
+`Tabular` gives it to other programs.
 """
 
 from __future__ import annotations

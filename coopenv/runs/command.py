@@ -17,7 +17,7 @@ from coopenv.base.files import replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import install_command
 from coopenv.base.seeds import checked_seed
-from coopenv.episode import SCENE_FILE
+from coopenv.episode import OF_TRAJECTORY, RECORDED, SCENE_FILE
 from coopenv.estimation.metrics import shown_note, shown_vehicles, steady_start
 from coopenv.estimation.observability import Observability, analyse_observability
 from coopenv.estimation.trajectory import Trajectory
@@ -88,7 +88,7 @@ def execute(
             run.engine.load()
         stride = frame_stride(scenario)
         with Progress(log, doing, run.ticks_planned, paced) as progress:
-            for tick in run.play():
+            for tick in run.play(OF_TRAJECTORY if out is None else RECORDED):
                 if tick % stride == 0:
                     progress.update(tick, describe() if describe is not None else None)
             if check is not None:

@@ -16,6 +16,9 @@ from coopenv.scenario import ScenarioLike
 from coopenv.sources.base import Backend
 from coopenv.sources.sources import open_backend
 
+OF_RECORDING = ("position", "rotation", "estimate_position", "estimate_rotation", "inbox_tick")
+"""Fields of an engine that a `Recording` is made of, beside what the vehicles measured."""
+
 
 def source_of(engine: Engine, name: str, seed: int | None, policy: str) -> Origin:
     """Return the heading of an episode; a recording has no seed and no driver, a prescribed motion no driver."""
@@ -43,7 +46,7 @@ def record(
     Raises:
         CoopenvError: unknown policy or observer, or the backend cannot begin.
     """
-    return record_episode(source, seed, policy, on_progress, on_tick).measured
+    return record_episode(source, seed, policy, on_progress, on_tick, fields=OF_RECORDING).measured
 
 
 def record_episode(
@@ -53,18 +56,18 @@ def record_episode(
     on_progress: Callable[[float], None] = lambda share: None,
     on_tick: Callable[[Engine, int], None] = lambda engine, tick: None,
     name: str = "",
-    more: Sequence[str] = (),
+    fields: Sequence[str] = RECORDED,
 ) -> Episode:
     """Return the episode of a backend with its recording.
 
-    Arguments are those of `record`, and `name`, which stands in its heading, and fields of the engine that are recorded
-    beside the usual ones.
+    Arguments are those of `record`, and `name`, which stands in its heading, and the fields of the engine that are
+    recorded, at least `OF_RECORDING`.
     """
     backend = source if isinstance(source, Backend) else open_backend(source, None, {})
     scenario = backend.scenario
     driver = load_policy(policy, scenario, seed)
     engine = Engine(scenario, 1, "float64", backend=backend)
-    views = Views(engine, (*RECORDED, *more))
+    views = Views(engine, fields)
     ticks: list[Sensed] = []
     faults: list[Interference | None] = []
     drawn = None

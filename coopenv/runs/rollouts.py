@@ -13,7 +13,7 @@ from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError, explained
 from coopenv.base.installation import version
-from coopenv.episode import Episode, Views
+from coopenv.episode import OF_TRAJECTORY, RECORDED, Episode, Views
 from coopenv.estimation import Outcome
 from coopenv.estimation.metrics import CONVERGED, mean_targets_in_view, observability_of, steady_mean, summarise
 from coopenv.estimation.observability import ConvergenceRates, Observability, convergence_rates, least_mean
@@ -76,8 +76,8 @@ class Rollout:
         """Camera ticks since t = 0 that have been recorded."""
         return max(0, self._views.taken - 1)
 
-    def play(self) -> Iterator[int]:
-        """Start the episode and yield the number of each camera tick, from 0, once it is recorded.
+    def play(self, fields: Sequence[str] = RECORDED) -> Iterator[int]:
+        """Start the episode and yield the number of each camera tick, from 0, once its fields are recorded.
 
         The run ends at the horizon, after `steps` decisions, or with the decision in which the last vehicle that is
         estimated here ended.
@@ -87,7 +87,7 @@ class Rollout:
             CoopenvError: an estimate is not finite.
         """
         start = perf_counter()
-        self._views = Views(self.engine)
+        self._views = Views(self.engine, fields)
         self.wall_time = 0.0
         moments = play(self.engine, [self.seed], self.ticks_planned, self.policy, False, self._options)
         for tick in moments:
@@ -154,7 +154,7 @@ def rollout(
         CoopenvError: an argument is not valid.
     """
     run = Rollout(load_scenario(scenario, overrides), seed, steps, dtype, device, policy)
-    for tick in run.play():
+    for tick in run.play(OF_TRAJECTORY):
         if on_tick is not None:
             on_tick(run.engine, tick)
     return run.trajectory()

@@ -13,7 +13,7 @@ import pytest
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from coopenv.episode import Episode
+from coopenv.episode import RECORDED, Episode
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.exports import STEPS, dataset_place, vehicle_episodes, write_dataset, write_tum
 from coopenv.runs.films import top_view_film, write_film
@@ -62,7 +62,7 @@ def episode_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Epis
         with warnings.catch_warnings(action="ignore"):  # of a short drive
             backend = SOURCES[source](tmp_path_factory.mktemp(source))
             policy = "route_follower" if source == "simulation" else "zero"
-            return record_episode(backend, 3, policy, name=source, more=STEPS)
+            return record_episode(backend, 3, policy, name=source, fields=(*RECORDED, *STEPS))
 
     return recorded
 

@@ -29,6 +29,7 @@ from coopenv.runs.command import noise_note
 from coopenv.runs.console import COLUMNS, gaps, legend, rates, remarks
 from coopenv.runs.exports import drive_vehicles
 from coopenv.runs.rollouts import Ending, outcome_line, run_metrics, theory_rates, vehicle_metrics
+from coopenv.sources.mcap import read_recording
 from tests.helpers.commands import printed, refused
 from tests.helpers.env_suite import SHIPPED
 from tests.helpers.four_way import FOUR_WAY
@@ -383,6 +384,18 @@ def test_a_full_disk_is_found_before_anything_is_written(root: Path, monkeypatch
     error = refused("dataset", "facade", "--worlds", "2")
     assert "the dataset may need" in error and "0.1 MiB are free" in error
     assert not list(root.iterdir())
+
+
+def test_a_log_gives_its_recorded_episode(root: Path, tmp_path: Path) -> None:
+    import minari
+
+    log = tmp_path / "drive.mcap"
+    assert main(["record", "facade", "--set", "horizon=1.0", "--out", str(log), "--no-scene"]) == 0
+    assert "--worlds: recorded data have one world" in refused("dataset", str(log), "--worlds", "2")
+    assert main(["dataset", str(log)]) == 0
+    dataset = minari.load_dataset("coopenv/drive/recorded-v0")
+    run, velocity = next(dataset.iterate_episodes()), read_recording(log).velocity[1:, 0]
+    np.testing.assert_allclose(run.actions[:, :3], velocity, rtol=1e-6)
 
 
 @pytest.mark.parametrize("identity", ["no_version", "../out-v0", "a b-v0", "-v0"])

@@ -231,7 +231,7 @@ def embedded(scenario: Scenario, seed: int) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def test_the_plug_in_is_the_embedded_observer_with_camera_and_markers_off_centre() -> None:
-    """Other cases are in tests/api/test_plugins.py."""
+    """Other cases are in tests/api/test_host_observers.py."""
     scenario = small_errors({"horizon": 2.0, "noise.bearing.scale": 0.003}, size=0.5)
     R, p, P, nees = embedded(scenario, 5)
     recording = record(scenario, 5)
