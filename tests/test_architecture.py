@@ -13,8 +13,9 @@ PACKAGE = Path(__file__).resolve().parents[1] / "coopenv"
 ROOMS = (
     ("base",),
     ("report",),
-    ("scenario",),
     ("estimation",),
+    ("measurements",),
+    ("scenario",),
     ("world",),
     ("observers",),
     ("sources", "backends"),

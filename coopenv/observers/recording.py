@@ -187,7 +187,8 @@ class Recording(Measurements):
         """Return the measurements of all vehicles at tick k."""
         sensed: dict[str, Any] = {name: values[k] for name, values in self.per_tick().items()}
         truth = Truth(self.truth.rotation[k], self.truth.position[k])
-        return Sensed(index=k, dt=self.dt, due=bool(self.due[k]), truth=truth, **sensed)
+        readings = {name: values[k] for name, values in self.readings.items()}
+        return Sensed(index=k, dt=self.dt, due=bool(self.due[k]), truth=truth, readings=readings, **sensed)
 
     def per_tick(self) -> dict[str, Any]:
         """Return by name the arrays that hold what was measured and received at every tick."""

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from coopenv.base.errors import CoopenvError
 from coopenv.base.sections import LARGEST
 from coopenv.estimation.poses import Array
+from coopenv.measurements.sensor import Reading, Sensor
 from coopenv.observers.arrays import ARRAYS, KINDS_OF_TICKS, invalid_rows, misshapen, sizes_of
 from coopenv.observers.contract import ObserverInit, Received, Setup, Tick, sealed
 from coopenv.observers.faults import Interference
@@ -44,6 +45,9 @@ class Measurements:
     visible: NDArray[np.bool_]  # (..., N, T)
     landmarks: Array  # (..., L, 3) map, m
     pan: Array | None = None  # (..., N) rad, by which cameras are turned to the left; None: 0
+    readings: Mapping[str, Array] = field(default_factory=dict)
+    """(..., N, T, size) of each sensor beside the camera, by its name; (..., N, 1, size) of one that measures the map.
+    NaN where nothing was measured."""
 
     def measured(self) -> dict[str, Array]:
         """Return the arrays of this class that are there, by name."""
@@ -104,7 +108,13 @@ class Sensed(Measurements):
             lever_arm=sealed(setup.lever_arm[:]),
             noise=setup.noise.moving(self.velocity[i], self.angular_velocity[i]),
             due=self.due,
+            readings=tuple(self.reading(setup, sensor) for sensor in setup.sensors),
         )
+
+    def reading(self, setup: Setup, sensor: Sensor) -> Reading:
+        """Return what a sensor of a vehicle has measured."""
+        of_vehicle = self.readings[sensor.name][setup.vehicle]
+        return Reading(sensor, sealed(of_vehicle[np.maximum(sensor.targets, 0)]))
 
 
 def is_due(index: ArrayLike, ratio: float) -> NDArray[np.bool_]:
@@ -113,7 +123,7 @@ def is_due(index: ArrayLike, ratio: float) -> NDArray[np.bool_]:
     return np.asarray(np.floor(k * ratio + 1e-9) > np.floor(np.maximum(k - 1, 0) * ratio + 1e-9))
 
 
-MEASURED = tuple(field.name for field in fields(Measurements))
+MEASURED = tuple(field.name for field in fields(Measurements) if field.name in ARRAYS)
 """Arrays of measurements."""
 REQUIRED = tuple(name for name in MEASURED if ARRAYS[name].optional is None)
 """Arrays of measurements that every tick has."""

@@ -151,6 +151,11 @@ def located(
         if isinstance(part, dict) and isinstance(part.get("custom"), dict):
             rows = {name: _located(row, folder, place) for name, row in part["custom"].items()}
             result[section] = {**part, "custom": rows}
+    if isinstance(sensors := result.get("sensors"), list):
+        kinds = [_located(entry.get("kind"), folder, place) if isinstance(entry, dict) else None for entry in sensors]
+        result["sensors"] = [
+            {**entry, "kind": kind} if kind else entry for entry, kind in zip(sensors, kinds, strict=True)
+        ]
     for section, keys in FILES.items():
         part = result.get(section)
         if isinstance(part, dict):

@@ -18,8 +18,8 @@ from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import are_numbers, are_rotations
 from coopenv.observers.contract import Message, ObserverInit, check_message
-from coopenv.observers.runner import observer_init_of
 from coopenv.observers.sensed import Sensed
+from coopenv.observers.setups import observer_init_of
 from coopenv.scenario import Scenario
 from coopenv.world.dynamics import ACCELERATION, PAN, SPEED, STEERING
 from coopenv.world.world import World

@@ -12,8 +12,8 @@ from coopenv.estimation.poses import exp_so3, exp_translation
 from coopenv.observers.contract import Message, ObserverInit
 from coopenv.observers.kernel_observer import views_of
 from coopenv.observers.registry import find_embedded
-from coopenv.observers.runner import start_covariances
 from coopenv.observers.sensed import Sensed, check_tick, is_due
+from coopenv.observers.setups import start_covariances
 from coopenv.sources.base import (
     Backend,
     Broadcasting,

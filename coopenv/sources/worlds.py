@@ -16,8 +16,8 @@ from coopenv.observers.arrays import ARRAYS
 from coopenv.observers.contract import ObserverInit
 from coopenv.observers.recording import Recording, check_recording
 from coopenv.observers.registry import find_embedded
-from coopenv.observers.runner import start_covariances
 from coopenv.observers.sensed import Sensed, Truth, is_due
+from coopenv.observers.setups import start_covariances
 from coopenv.scenario import Scenario, parse_scenario
 from coopenv.scenario.files import override
 from coopenv.scenario.schema import neighbour_sets, processing_order

@@ -1,0 +1,36 @@
+"""Orientation on the map: what a compass and an inclinometer measure together, or a level floor."""
+
+import numpy as np
+
+from coopenv.estimation.poses import Array
+from coopenv.measurements.kinds import Kind, Placed, derivatives, exponential, logarithm
+
+
+class Attitude(Kind):
+    """Orientation of the sensor: the rotation vector to the map, rad.
+
+    The noise turns about the map's axes: roll and pitch, then the heading. A large deviation leaves one of them out,
+    so that a level floor is an attitude without a heading.
+    """
+
+    rows = size = 3
+    has_target = False
+    noise, units = (0.02, 0.02, 0.05), ("rad", "rad", "rad")
+    towards = ("map",)
+
+    def predict(self, own: Placed, target: Placed) -> Array:
+        """Return rotation vectors (..., 3), rad."""
+        return logarithm(own.rotation)
+
+    def residual(self, value: Array, predicted: Array) -> Array:
+        """Return (..., 3) rad: the rotation vector, in map axes, from the predicted orientation to the measured one."""
+        return logarithm(exponential(value) @ np.swapaxes(exponential(predicted), -1, -2))
+
+    def jacobian(self, own: Placed, target: Placed) -> tuple[Array, Array]:
+        """Return the derivatives: a turn about own axes is one about the map's by the rotation."""
+        by_own = derivatives(own.rotation, np.zeros_like(own.rotation))
+        return by_own, np.zeros_like(by_own)
+
+    def sample(self, predicted: Array, noise: Array) -> Array:
+        """Return the rotation vectors of orientations turned by the noise about the map's axes."""
+        return logarithm(exponential(noise) @ exponential(predicted))

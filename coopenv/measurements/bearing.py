@@ -1,0 +1,54 @@
+"""Direction to a target, a unit vector in the sensor's axes: what a camera measures."""
+
+import numpy as np
+
+from coopenv.estimation.poses import Array, skew
+from coopenv.measurements.kinds import Kind, Placed, derivatives, in_axes, unit
+
+
+def across(u: Array) -> Array:
+    """Return orthonormal rows (..., 2, 3) across unit vectors (..., 3).
+
+    Source: Duff et al., Building an orthonormal basis, revisited, Journal of Computer Graphics Techniques 6(1), 2017.
+    """
+    x, y, z = np.moveaxis(u, -1, 0)
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    c = x * y * a
+    first = np.stack([1.0 + sign * x * x * a, sign * c, -sign * x], axis=-1)
+    return np.stack([first, np.stack([c, sign + y * y * a, -y], axis=-1)], axis=-2)
+
+
+class Bearing(Kind):
+    """Direction to a target."""
+
+    rows, size = 2, 3
+    noise, units = (2.9e-3, 2.9e-3), ("rad", "rad")
+
+    def predict(self, own: Placed, target: Placed) -> Array:
+        """Return unit vectors (..., 3) from the sensor to the target, the sensor's axes."""
+        return unit(in_axes(own.rotation, target.position - own.position))[0]
+
+    def residual(self, value: Array, predicted: Array) -> Array:
+        """Return (..., 2) rad: the value in the tangent plane of the predicted direction."""
+        return np.asarray((across(predicted) @ value[..., None])[..., 0])
+
+    def jacobian(self, own: Placed, target: Placed) -> tuple[Array, Array]:
+        """Return the derivatives in the tangent plane."""
+        u, D_own, D_target = self.line(own, target)
+        B = across(u)
+        return B @ D_own, B @ D_target
+
+    def line(self, own: Placed, target: Placed) -> tuple[Array, Array, Array]:
+        """Return u (..., 3) and its derivatives (..., 3, 6) by errors of the sensor and of the target.
+
+        A turn theta takes u to u + u x theta; a shift of the target moves u across itself, by 1 / distance.
+        """
+        u, distance = unit(in_axes(own.rotation, target.position - own.position))
+        plane = (np.eye(3) - u[..., :, None] * u[..., None, :]) / distance[..., None]
+        shift = plane @ np.swapaxes(own.rotation, -1, -2)
+        return u, derivatives(skew(u), -shift), derivatives(None, shift)
+
+    def sample(self, predicted: Array, noise: Array) -> Array:
+        """Return unit vectors: predicted ones moved in their tangent planes."""
+        return unit(predicted + (np.swapaxes(across(predicted), -1, -2) @ noise[..., None])[..., 0])[0]

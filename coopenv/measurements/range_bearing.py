@@ -1,0 +1,37 @@
+"""Direction and distance to a target: what a camera measures by the size of a known mark, or a lidar."""
+
+import numpy as np
+
+from coopenv.estimation.poses import Array
+from coopenv.measurements.bearing import Bearing
+from coopenv.measurements.kinds import Kind, Placed
+from coopenv.measurements.range import Range
+
+BEARING, RANGE = Bearing(), Range()
+
+
+class RangeBearing(Kind):
+    """Direction to a target, a unit vector, and its distance, m."""
+
+    rows, size = 3, 4
+    noise, units = (*BEARING.noise, *RANGE.noise), (*BEARING.units, *RANGE.units)
+
+    def predict(self, own: Placed, target: Placed) -> Array:
+        """Return (..., 4): the unit vector in the sensor's axes and the distance, m."""
+        return np.concatenate([part.predict(own, target) for part in (BEARING, RANGE)], axis=-1)
+
+    def residual(self, value: Array, predicted: Array) -> Array:
+        """Return (..., 3): rad, rad, m."""
+        direction = BEARING.residual(value[..., :3], predicted[..., :3])
+        return np.concatenate([direction, value[..., 3:] - predicted[..., 3:]], axis=-1)
+
+    def jacobian(self, own: Placed, target: Placed) -> tuple[Array, Array]:
+        """Return the derivatives of both parts."""
+        parts = [part.jacobian(own, target) for part in (BEARING, RANGE)]
+        by_own, by_target = (np.concatenate(rows, axis=-2) for rows in zip(*parts, strict=True))
+        return by_own, by_target
+
+    def sample(self, predicted: Array, noise: Array) -> Array:
+        """Return the parts with their noise."""
+        direction = BEARING.sample(predicted[..., :3], noise[..., :2])
+        return np.concatenate([direction, predicted[..., 3:] + noise[..., 2:]], axis=-1)

@@ -1,0 +1,37 @@
+"""Pose of a target in the sensor's axes: what a camera measures of a tag, or of a vehicle of known shape."""
+
+import numpy as np
+
+from coopenv.estimation.poses import Array, skew
+from coopenv.measurements.kinds import Kind, Placed, derivatives, exponential, in_axes, logarithm
+
+
+class RelativePose(Kind):
+    """Position of a target, m, and its orientation, a rotation vector in rad, both in the sensor's axes."""
+
+    rows = size = 6
+    noise, units = (0.05,) * 3 + (0.02,) * 3, ("m",) * 3 + ("rad",) * 3
+
+    def predict(self, own: Placed, target: Placed) -> Array:
+        """Return (..., 6): position, m, and rotation vector, rad, NaN if the target's orientation is not known."""
+        turned = np.swapaxes(own.rotation, -1, -2) @ target.rotation
+        return np.concatenate([in_axes(own.rotation, target.position - own.position), logarithm(turned)], axis=-1)
+
+    def residual(self, value: Array, predicted: Array) -> Array:
+        """Return (..., 6): m, and the rotation vector from the predicted orientation to the measured one, rad."""
+        turned = exponential(value[..., 3:]) @ np.swapaxes(exponential(predicted[..., 3:]), -1, -2)
+        return np.concatenate([value[..., :3] - predicted[..., :3], logarithm(turned)], axis=-1)
+
+    def jacobian(self, own: Placed, target: Placed) -> tuple[Array, Array]:
+        """Return the derivatives: those of a = R^T (z - p) are S(a) by a turn and R^T by a shift of the target."""
+        to_own = np.swapaxes(own.rotation, -1, -2)
+        a, zero = in_axes(own.rotation, target.position - own.position), np.zeros_like(to_own)
+        place = derivatives(skew(a), -to_own), derivatives(None, to_own)
+        turn = derivatives(zero - np.eye(3), zero), derivatives(to_own @ target.rotation, zero)
+        by_own, by_target = (np.concatenate(rows, axis=-2) for rows in zip(place, turn, strict=True))
+        return by_own, by_target
+
+    def sample(self, predicted: Array, noise: Array) -> Array:
+        """Return shifted positions and orientations turned by the noise, both in the sensor's axes."""
+        turned = exponential(noise[..., 3:]) @ exponential(predicted[..., 3:])
+        return np.concatenate([predicted[..., :3] + noise[..., :3], logarithm(turned)], axis=-1)

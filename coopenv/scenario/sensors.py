@@ -1,0 +1,114 @@
+"""Sensors beside the camera: what each one measures, on which vehicles, towards what, and how well."""
+
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from coopenv.base import units
+from coopenv.base.errors import CoopenvError, check_one_of, shown
+from coopenv.base.installation import check_reference, is_reference
+from coopenv.base.sections import NonNegative, Positive, QuaternionWxyz, Rate, Section, Vector3
+from coopenv.measurements.kinds import KINDS
+
+GROUPS = ("landmarks", "vehicles", "anchors", "map")
+"""What a sensor may measure, beside single landmarks and vehicles by name."""
+MOST_SENSORS = 16
+
+
+class Correlated(Section):
+    """An error that changes slowly, as by multipath: a Gauss-Markov process of first order in each row."""
+
+    std: NonNegative = 0.0
+    """Standard deviation, in the units of the noise."""
+    time: Annotated[Positive, units.TIME] = 10.0
+    """Correlation time, s."""
+
+
+class Outages(Section):
+    """Times without any measurement of the sensor, drawn per vehicle."""
+
+    rate: NonNegative = 0.0
+    """Outages begin so often, 1/s."""
+    duration: Annotated[Positive, units.TIME] = 5.0
+    """Mean duration, s; durations are exponentially distributed."""
+
+
+class Outliers(Section):
+    """Measurements that are wrong, as a range by a reflection; drawn per target and measurement."""
+
+    probability: units.Chance = 0.0
+    size: NonNegative = 5.0
+    """Mean of an exponentially distributed error, in the units of the noise; it is added to every row."""
+
+
+class SensorSection(Section):
+    """A sensor beside the camera."""
+
+    kind: str = Field(min_length=1, max_length=1_000)
+    """A kind of coopenv, or `file.py:Class`, see docs/contributing/sensor.md."""
+    name: str = Field(default="", max_length=64, pattern=r"^([A-Za-z][A-Za-z0-9_]*)?$")
+    """Name in ticks, logs and tables (default: the kind, or the name of the class in lower case)."""
+    vehicles: tuple[str, ...] | None = None
+    """Names of the vehicles that have it (default: all)."""
+    towards: tuple[str, ...] | None = None
+    """What it measures: `landmarks`, `vehicles`, `anchors` (landmarks for radios, which cameras do not see), `map`, and
+    names of landmarks, groups and vehicles (default: the kind's own)."""
+    rate: Annotated[Rate | None, units.FREQUENCY] = None
+    """Measurements per second, at the nearest camera ticks (none: at every tick)."""
+    position: Annotated[Vector3, units.LENGTH] = (0.0, 0.0, 0.0)
+    """Place in the body frame, m."""
+    orientation: Literal["body"] | QuaternionWxyz = "body"
+    """Sensor to body: `body` has the body's own axes, x forward."""
+    noise: Positive | tuple[Positive, ...] | None = None
+    """Standard deviation of every row, or one for each (default: the kind's own)."""
+    range: Annotated[Positive | None, units.DISTANCE] = None
+    """Farthest distance of a target, m (none: unlimited)."""
+    field_of_view: Annotated[Positive | None, units.HEADING] = None
+    """Full angle of the cone about the sensor's x axis in which targets lie, rad (none: every direction)."""
+    occluded: bool = True
+    """Whether buildings and bodies between it and a target hide the target."""
+    miss_probability: units.Chance = 0.0
+    """Chance that a measurement is lost, drawn per target and measurement."""
+    bias: NonNegative = 0.0
+    """Standard deviation of a constant error of every row, drawn per vehicle and episode."""
+    correlated: Correlated = Correlated()
+    outages: Outages = Outages()
+    outliers: Outliers = Outliers()
+    options: dict[str, Any] = Field(default={})
+    """Arguments of a class of one's own."""
+
+    @property
+    def label(self) -> str:
+        """Its name, given or by its kind."""
+        return self.name or self.kind.rpartition(":")[2].lower()
+
+    @model_validator(mode="after")
+    def _kind_exists(self) -> Self:
+        if is_reference(self.kind):
+            try:
+                check_reference(self.kind)
+            except CoopenvError as error:
+                raise ValueError(f"kind: {error}") from None
+        elif self.options:
+            raise ValueError(f"options: for a class of one's own, not for '{self.kind}'")
+        else:
+            check_one_of("kind: unknown kind of sensor", self.kind, KINDS, ValueError)
+        return self
+
+
+def problems_of_sensors(
+    sensors: Sequence[SensorSection], vehicles: Sequence[str], targets: Sequence[str], groups: Sequence[str]
+) -> Iterator[str]:
+    """Yield the conflicts of sensors with each other, with vehicles and with targets, all by name."""
+    names = [sensor.label for sensor in sensors]
+    for i, sensor in enumerate(sensors):
+        if names.index(names[i]) != i or names[i] == "camera":
+            yield f"sensors.{i}.name: the name {shown(names[i])} is used twice"
+        known: dict[str, Sequence[str]] = {
+            "vehicles": vehicles,
+            "towards": [*GROUPS, *targets, *groups],
+        }
+        for key, allowed in known.items():
+            for name in [name for name in getattr(sensor, key) or () if name not in allowed][:1]:
+                check_one_of(f"sensors.{i}.{key}: unknown name", name, allowed, ValueError)
