@@ -11,6 +11,7 @@ class RelativePose(Kind):
 
     rows = size = 6
     noise, units = (0.05,) * 3 + (0.02,) * 3, ("m",) * 3 + ("rad",) * 3
+    needs = ("rotation",)
 
     def predict(self, own: Placed, target: Placed) -> Array:
         """Return (..., 6): position, m, and rotation vector, rad, NaN if the target's orientation is not known."""
