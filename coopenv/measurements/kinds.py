@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +70,19 @@ def logarithm(R: Array) -> Array:
     return np.where(known[..., None], vectors.reshape(R.shape[:-1]), np.nan)
 
 
+class WarpFunctions(NamedTuple):
+    """A kind in kernels: Warp functions in any precision, in the conventions of `Kind`, of one measurement.
+
+    Values, noise and residuals are vectors of six numbers, zero beyond their size.
+    """
+
+    predict: Any
+    """(own rotation, position, velocity, target rotation, position, velocity, empty value): return the value; arguments
+    as the fields of `Placed`, rotations (3, 3), the others (3,)."""
+    sample: Any
+    """(predicted value, noise, a vector (3,) for its type): return the measured value."""
+
+
 class Kind:
     """A kind of measurement; arrays may have leading axes (...) of a batch.
 
@@ -83,6 +96,8 @@ class Kind:
     noise: tuple[float, ...]  # (rows,) standard deviations where a scenario states no other
     units: tuple[str, ...]  # (rows,) of the residual
     towards: tuple[str, ...] = ("landmarks", "vehicles")  # what it measures where a scenario does not say
+    under_sky = False  # True: what hides the sky above it occludes it, as for a receiver of satellites
+    in_warp: WarpFunctions | None = None  # None: it is computed in NumPy alone
 
     def predict(self, own: Placed, target: Placed) -> Array:
         """Return values (..., size) without noise; `target` is the map's origin where the kind has no target."""
