@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.poses import Array, skew
 
+MOST_ROWS = 6  # of a kind, and numbers of its value
 STEP = 1e-3
 """rad and m, of differences, whose error is of the fourth order: 1e-11 for a range of 50 m."""
 WEIGHTS = {1.0: 2.0 / 3.0, 2.0: -1.0 / 12.0}  # of central differences over one and two steps
