@@ -215,9 +215,8 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     sensors = [entry_struct(p, "sensor")() for _ in scenario.sensors]
     for made, section in zip(sensors, scenario.sensors, strict=True):
         _fill(made, device, sensor_entries(section, scenario))
-    if sensors:
-        _fill(model, device, sensor_tables(scenario))
-        model.sensor = wp.array(sensors, dtype=entry_struct(p, "sensor"), device=device)
+    _fill(model, device, sensor_tables(scenario))
+    model.sensor = wp.array(sensors, dtype=entry_struct(p, "sensor"), device=device)
     return model
 
 
