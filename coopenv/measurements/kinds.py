@@ -43,6 +43,13 @@ class Placed:
         velocity = (with_it @ self.velocity[..., None])[..., 0]
         return replace(self, position=self.position + error[..., 3:], rotation=turned, velocity=velocity)
 
+    def repeated(self, count: int) -> "Placed":
+        """Return a batch (count,) of this one."""
+        arrays: dict[str, Any] = {
+            name: np.broadcast_to(getattr(self, name), (count, *of)) for name, of in SHAPES.items()
+        }
+        return replace(self, **arrays)
+
     def each(self) -> Iterator["Placed"]:
         """Yield the entries of a batch."""
         shape = self.position.shape[:-1]
@@ -99,6 +106,7 @@ class Kind:
     towards: tuple[str, ...] = ("landmarks", "vehicles")  # what it measures where a scenario does not say
     under_sky = False  # True: what hides the sky above it occludes it, as for a receiver of satellites
     in_warp: WarpFunctions | None = None  # None: it is computed in NumPy alone
+    needs: tuple[str, ...] = ()  # "rotation" and "velocity": what it has to know of a target beside the position
 
     def predict(self, own: Placed, target: Placed) -> Array:
         """Return values (..., size) without noise; `target` is the map's origin where the kind has no target."""

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -124,9 +125,22 @@ class OwnKind(Kind):
             if self.rows != self.size and not hasattr(self.own, "sample"):
                 sizes = f"predict returns {self.size} numbers and residual {self.rows}"
                 raise CoopenvError(f"sensor '{self.reference}': sample: missing; {sizes}")
+            self.needs = self._needs(own, target) if self.has_target else ()
             self.units = tuple(getattr(self.own, "units", ("1",) * self.rows))
             if hasattr(self.own, "jacobian"):
                 self._compare(own, target)
+
+    def _needs(self, own: Placed, target: Placed) -> tuple[str, ...]:
+        """Return what is needed of a target beside its position: without it there is no prediction."""
+        found = []
+        for name in ("rotation", "velocity"):
+            without = replace(target, **{name: np.full_like(getattr(target, name), np.nan)})
+            try:
+                known = bool(np.isfinite(np.asarray(self.own.predict(own, without), dtype=np.float64)).all())
+            except Exception:  # of any user's code
+                known = False
+            found += [] if known else [name]
+        return tuple(found)
 
     def _noise(self) -> tuple[float, ...]:
         given = np.atleast_1d(np.asarray(getattr(self.own, "noise", np.nan), dtype=float))

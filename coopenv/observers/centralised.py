@@ -36,19 +36,11 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from coopenv.estimation.poses import Array, exp_so3, orthonormalise, skew
-from coopenv.observers import bearing_measurements
-from coopenv.observers.bearing_measurements import (
-    LEFT,
-    BearingMeasurements,
-    LinearisedBearings,
-    UncertainPose,
-    increment,
-    linearised,
-    measured_message,
-    transition,
-)
+from coopenv.observers import uncertain_pose
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.correction import InnovationGate, Stacked, gain, joseph
+from coopenv.observers.frame import LinearMeasurements, UsableMeasurements, linearised, measured_message
+from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, transition
 
 Masks = dict[int, NDArray[np.bool_]]
 """Masks of the visible targets, by vehicle that saw any."""
@@ -111,7 +103,7 @@ class Centralised:
         """Correct by the bearings of masks (m,) by vehicle that pass the vehicles' gates, in one update."""
         before, P = self.poses, self.P
         linear = {i: self.linearise(i, ticks[i], mask) for i, mask in seen.items()}
-        kept = {i: self.gates[i].passed(ticks[i].time, of.residual, of.spread(P), of.ahead) for i, of in linear.items()}
+        kept = {i: self.gates[i].passed(ticks[i].time, of, of.spread(P)) for i, of in linear.items()}
         residual, H, N = _stacked([of.only(kept[i]) for i, of in linear.items()])
         if not len(residual):
             return
@@ -128,12 +120,12 @@ class Centralised:
         G = self.recentring(dx)
         self.poses, self.P = self.moved(before, dx), G.dot(joseph(P, K, H, N)).dot(G.T)
 
-    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> LinearisedBearings:
+    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> LinearMeasurements:
         """Return the bearings of a mask (m,) of vehicle i, linearised by all errors."""
         targets = tick.targets[mask].tolist()
         z = np.array([self.place(target, tick) for target in targets], float).reshape(-1, 3)
         bearings = np.asarray(tick.bearings[mask], float)
-        known = BearingMeasurements(bearings, z, np.zeros((len(z), 3, 3)), np.array(targets), np.full(len(z), None))
+        known = UsableMeasurements(bearings, z, np.zeros((len(z), 3, 3)), np.array(targets), np.full(len(z), None))
         own = linearised(UncertainPose(LEFT, *self.poses[i], self.P), tick, known)
         H = np.zeros((len(z), 2, len(self.P)))
         H[:, :, self.block(i)] = own.H
@@ -159,16 +151,16 @@ class Centralised:
 
     @staticmethod
     def recentring(dx: Array) -> Array:
-        """Return (6N, 6N) what `bearing_measurements.recentring` returns, of every pose."""
-        return np.asarray(block_diag(*(bearing_measurements.recentring(LEFT, e) for e in dx.reshape(-1, 6))))
+        """Return (6N, 6N) what `uncertain_pose.recentring` returns, of every pose."""
+        return np.asarray(block_diag(*(uncertain_pose.recentring(LEFT, e) for e in dx.reshape(-1, 6))))
 
     def messages(self) -> list[Message]:
         """Return the raw measurements of this tick: odometry and bearings."""
         return self.sent
 
 
-def _stacked(linear: Sequence[LinearisedBearings]) -> Stacked:
-    return LinearisedBearings(*(np.concatenate(parts) for parts in zip(*linear, strict=True))).stacked()
+def _stacked(linear: Sequence[LinearMeasurements]) -> Stacked:
+    return LinearMeasurements(*(np.concatenate(parts) for parts in zip(*linear, strict=True))).stacked()
 
 
 class FirstEstimatesEkf(Centralised):
@@ -210,7 +202,7 @@ class FirstEstimatesEkf(Centralised):
             F[6 * i + 3 : 6 * i + 6, 6 * i : 6 * i + 3] = skew(self.first[i] - p - R.dot(tick.translation))
         return F
 
-    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> LinearisedBearings:
+    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> LinearMeasurements:
         """Return the bearings of a mask (m,) of vehicle i, linearised by all errors."""
         linear = super().linearise(i, tick, mask)
         return linear._replace(H=self.turned(linear.H))
@@ -244,7 +236,7 @@ class ObservabilityConstrainedEkf(FirstEstimatesEkf):
         NT = np.swapaxes(N, -1, -2)
         self.projection = N @ np.linalg.solve(NT @ N, NT)  # (N, N, 12, 12)
 
-    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> LinearisedBearings:
+    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> LinearMeasurements:
         """Return the bearings of a mask (m,) of vehicle i, linearised by all errors."""
         linear = super().linearise(i, tick, mask)
         targets = tick.targets[mask] - self.landmarks

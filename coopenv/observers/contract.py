@@ -200,6 +200,7 @@ class Tick:
     noise: SensorNoise  # standard deviations, those of the setup at the velocity of this tick
     due: bool = True  # whether the scenario's observer rate (`rates.observer`) asks for a correction at this frame
     readings: tuple[Reading, ...] = ()  # of the sensors beside the camera, in the order of `Setup.sensors`
+    landmark_rotation: Array | None = None  # as in `Setup`
 
     def usable(self) -> list[tuple[int, Array, Array, Message | None]]:
         """Return (target, bearing, position, message) of every measured target with a known or received position.

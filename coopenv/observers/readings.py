@@ -44,11 +44,11 @@ def problems_of_readings(
             got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
             yield f"readings.{name}: expected numbers of shape {shape}, got {got}"
             continue
-        valid = (np.abs(value) <= LARGEST).all(axis=-1) | np.isnan(value).all(axis=-1)
-        if ignored is not None:
-            valid[..., ignored, :] = True
+        numbers = (np.abs(value) <= LARGEST).all(axis=-1)
+        skipped = np.False_ if ignored is None else ignored[:, None]
+        valid = np.asarray(numbers | np.isnan(value).all(axis=-1) | skipped)
         if not valid.all():
             *k, i, _ = np.argwhere(~valid)[0].tolist()
             when = f", tick {k[0]}" if k else ""
-            numbers = f"finite numbers of at most {LARGEST:g}, or NaN where nothing is measured"
-            yield f"readings.{name} of {setups[i].name}{when}: not {numbers}"
+            expected = f"finite numbers of at most {LARGEST:g}, or NaN where nothing is measured"
+            yield f"readings.{name} of {setups[i].name}{when}: not {expected}"

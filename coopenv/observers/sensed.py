@@ -114,6 +114,7 @@ class Sensed(Measurements):
             noise=setup.noise.moving(self.velocity[i], self.angular_velocity[i]),
             due=self.due,
             readings=tuple(self.reading(setup, sensor) for sensor in setup.sensors),
+            landmark_rotation=setup.landmark_rotation,
         )
 
     def reading(self, setup: Setup, sensor: Sensor) -> Reading:

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import CoopenvError, DataError, ScenarioWarning
 from coopenv.estimation import Sight
-from coopenv.estimation.poses import Array
 from coopenv.observers.arrays import ARRAYS
 from coopenv.observers.contract import ObserverInit, Setup, sealed
 from coopenv.observers.recording import Recording, check_recording
@@ -294,7 +294,7 @@ def of_robots(recording: Recording, kept: Sequence[int]) -> Recording:
     )
 
 
-def without_targets(setup: Setup, gone: Array) -> Setup:
+def without_targets(setup: Setup, gone: NDArray[np.int64]) -> Setup:
     """Return a setup whose vehicle measures none of some targets, with any sensor."""
     sensors = tuple(replace(sensor, targets=sensor.targets[~np.isin(sensor.targets, gone)]) for sensor in setup.sensors)
     return replace(setup, targets=np.setdiff1d(setup.targets, gone), sensors=sensors)

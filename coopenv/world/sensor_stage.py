@@ -5,9 +5,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.poses import Array
 from coopenv.measurements.kinds import MOST_ROWS, Placed
 from coopenv.measurements.sensor import Sensor
 from coopenv.scenario import Scenario
@@ -16,6 +16,8 @@ from coopenv.world.launch import Call, PerWorld
 from coopenv.world.model import Precision
 from coopenv.world.sensors import drawn_struct, sensor_kernel
 from coopenv.world.state import allocate, state_sizes
+
+Indices = NDArray[np.int64]
 
 
 class SensorStage:
@@ -74,7 +76,7 @@ class SensorStage:
                 if len(i):
                     self._measure(w, d, i, target, int(now[w]))
 
-    def _measure(self, w: int, d: int, i: Array, target: Array, tick: int) -> None:
+    def _measure(self, w: int, d: int, i: Indices, target: Indices, tick: int) -> None:
         """Write the values of one sensor of vehicles i (m,) towards targets (m,) in a world."""
         kind = self._kinds[d]
         found = kind.sensed(*self._places(w, d, i, target))
@@ -88,14 +90,14 @@ class SensorStage:
         self._state.reading.numpy()[w, i, d, target] = np.pad(values, [(0, 0), (0, MOST_ROWS - kind.size)])
         self._state.reading_tick.numpy()[w, i, d, target] = tick
 
-    def _places(self, w: int, d: int, i: Array, target: Array) -> tuple[Placed, Placed]:
+    def _places(self, w: int, d: int, i: Indices, target: Indices) -> tuple[Placed, Placed]:
         """Return where a sensor of vehicles i (m,) is, and targets (m,), in a world."""
         L, markers = self._model.landmarks, np.array(self._model.scene.marker.numpy(), float)
         R, position, velocity, turning = (np.array(getattr(self._state, name).numpy()[w], float) for name in POSES)
         points = position + (R @ markers[..., None])[..., 0]
         marks = dict(zip(self._scenario.target_names[:L], points[:L], strict=True))
-        bodies = (values[L + i] for values in (R, position, velocity, turning))
-        own = self._sensors[d].placed(*bodies, marks)
+        at = L + i
+        own = self._sensors[d].placed(R[at], position[at], velocity[at], turning[at], marks)
         if not self._kinds[d].has_target:
             return own, Placed.at(np.zeros((len(i), 3)))
         moving = velocity[target] + np.cross(turning[target], markers[target])
