@@ -112,6 +112,11 @@ class Kind:
         """Return values (..., size) without noise; `target` is the map's origin where the kind has no target."""
         raise NotImplementedError
 
+    @property
+    def parts(self) -> tuple[tuple[str, int, str], ...]:
+        """Name, size and unit of the parts of a value; one without a name is the whole value."""
+        return (("", self.size, self.units[0]),)
+
     def residual(self, value: Array, predicted: Array) -> Array:
         """Return (..., rows) by how much values exceed predicted ones, to first order linear in errors."""
         return value - predicted

@@ -40,6 +40,7 @@ class RelativePose(Kind):
     rows = size = 6
     noise, units = (0.05,) * 3 + (0.02,) * 3, ("m",) * 3 + ("rad",) * 3
     in_warp = WarpFunctions(predict_relative_pose, sample_relative_pose)
+    parts = (("position", 3, "m"), ("turn", 3, "rad"))
     needs = ("rotation",)
 
     def predict(self, own: Placed, target: Placed) -> Array:
