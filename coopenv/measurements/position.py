@@ -1,9 +1,19 @@
 """Position on the map: what a receiver of navigation satellites measures, in the map's axes."""
 
+from typing import Any
+
 import numpy as np
+import warp as wp
 
 from coopenv.estimation.poses import Array
-from coopenv.measurements.kinds import Kind, Placed, derivatives
+from coopenv.measurements.in_warp import joined, plus_noise
+from coopenv.measurements.kinds import Kind, Placed, WarpFunctions, derivatives
+
+
+@wp.func
+def predict_position(R: Any, p: Any, v: Any, target_R: Any, target_p: Any, target_v: Any, empty: Any):
+    """Return the position of the antenna, map, m."""
+    return joined(p, p - p, empty)
 
 
 class Position(Kind):
@@ -13,6 +23,8 @@ class Position(Kind):
     has_target = False
     noise, units = (1.0, 1.0, 2.0), ("m", "m", "m")
     towards = ("map",)
+    under_sky = True
+    in_warp = WarpFunctions(predict_position, plus_noise)
 
     def predict(self, own: Placed, target: Placed) -> Array:
         """Return positions (..., 3) of the antenna, map, m."""

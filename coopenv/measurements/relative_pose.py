@@ -1,9 +1,37 @@
 """Pose of a target in the sensor's axes: what a camera measures of a tag, or of a vehicle of known shape."""
 
-import numpy as np
+from typing import Any
 
+import numpy as np
+import warp as wp
+
+from coopenv.estimation.linalg import exp_so3
 from coopenv.estimation.poses import Array, skew
-from coopenv.measurements.kinds import Kind, Placed, derivatives, exponential, in_axes, logarithm
+from coopenv.measurements.in_warp import first_three, joined, last_three, rotation_vector
+from coopenv.measurements.kinds import (
+    Kind,
+    Placed,
+    WarpFunctions,
+    derivatives,
+    exponential,
+    in_axes,
+    logarithm,
+)
+
+
+@wp.func
+def predict_relative_pose(R: Any, p: Any, v: Any, target_R: Any, target_p: Any, target_v: Any, empty: Any):
+    """Return the target's position, m, and rotation vector, rad, in the sensor's axes."""
+    to_own = wp.transpose(R)
+    return joined(to_own * (target_p - p), rotation_vector(to_own * target_R, p), empty)
+
+
+@wp.func
+def sample_relative_pose(predicted: Any, noise: Any, like: Any):
+    """Return the shifted position and the orientation turned by the noise."""
+    turned = exp_so3(last_three(noise, like)) * exp_so3(last_three(predicted, like))
+    place = first_three(predicted, like) + first_three(noise, like)
+    return joined(place, rotation_vector(turned, like), predicted)
 
 
 class RelativePose(Kind):
@@ -12,6 +40,7 @@ class RelativePose(Kind):
     rows = size = 6
     noise, units = (0.05,) * 3 + (0.02,) * 3, ("m",) * 3 + ("rad",) * 3
     needs = ("rotation",)
+    in_warp = WarpFunctions(predict_relative_pose, sample_relative_pose)
 
     def predict(self, own: Placed, target: Placed) -> Array:
         """Return (..., 6): position, m, and rotation vector, rad, NaN if the target's orientation is not known."""

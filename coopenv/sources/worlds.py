@@ -13,7 +13,7 @@ import warp as wp
 from coopenv.base.errors import CoopenvError, DataError, ScenarioWarning
 from coopenv.estimation import Sight
 from coopenv.observers.arrays import ARRAYS
-from coopenv.observers.contract import ObserverInit
+from coopenv.observers.contract import ObserverInit, sealed
 from coopenv.observers.recording import Recording, check_recording
 from coopenv.observers.registry import find_embedded
 from coopenv.observers.sensed import Sensed, Truth, is_due
@@ -60,7 +60,17 @@ class SimulatedWorld(SensingWorld):
         for values in arrays.values():
             values.setflags(write=False)
         due = bool(is_due(k, self.model.observer.rate / rates.camera))
-        return Sensed(index=k, dt=1.0 / rates.camera, due=due, **arrays)
+        return Sensed(index=k, dt=1.0 / rates.camera, due=due, readings=self._readings(world, k), **arrays)
+
+    def _readings(self, world: int, k: int) -> dict[str, np.ndarray]:
+        """Return what the sensors beside the camera have measured at tick k, by name."""
+        readings = {}
+        for d, section in enumerate(self.scenario.sensors):
+            entries = slice(None) if section.made.has_target else slice(1)
+            measured = self.view("reading_tick")[world, :, d, entries] == k
+            values = np.array(self.view("reading")[world, :, d, entries, : section.made.size], dtype=float)
+            readings[section.label] = sealed(np.where(measured[..., None], values, np.nan))
+        return readings
 
     def full_tick(self, k: int) -> Sensed:
         """Return the tick of the first world with truth and deliveries."""
