@@ -89,6 +89,11 @@ class WarpFunctions(NamedTuple):
     as the fields of `Placed`, rotations (3, 3), the others (3,)."""
     sample: Any
     """(predicted value, noise, a vector (3,) for its type): return the measured value."""
+    residual: Any = None
+    """(value, predicted value, a vector (3,) for its type): return the rows. None: no observer in kernels takes it."""
+    jacobian: Any = None
+    """(as `predict`, without the last): return the derivatives (6, 6) by errors of the sensor and of the target; rows
+    beyond the kind's are zero."""
 
 
 class Kind:
