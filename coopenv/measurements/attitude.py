@@ -7,7 +7,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import exp_so3
 from coopenv.estimation.poses import Array
-from coopenv.measurements.in_warp import first_three, joined, rotation_vector
+from coopenv.measurements.in_warp import first_three, joined, rotation_vector, rows_of
 from coopenv.measurements.kinds import Kind, Placed, WarpFunctions, derivatives, exponential, logarithm
 
 
@@ -24,6 +24,20 @@ def sample_attitude(predicted: Any, noise: Any, like: Any):
     return joined(rotation_vector(turned, like), like - like, predicted)
 
 
+@wp.func
+def attitude_residual(value: Any, predicted: Any, like: Any):
+    """Return the rotation vector, in map axes, from the predicted orientation to the measured one, rad."""
+    turned = exp_so3(first_three(value, like)) * wp.transpose(exp_so3(first_three(predicted, like)))
+    return joined(rotation_vector(turned, like), like - like, predicted)
+
+
+@wp.func
+def derive_attitude(R: Any, p: Any, v: Any, target_R: Any, target_p: Any, target_v: Any):
+    """Return the derivatives: a turn about own axes is one about the map's by the rotation."""
+    by_own = rows_of(R, R - R)
+    return by_own, by_own - by_own
+
+
 class Attitude(Kind):
     """Orientation of the sensor: the rotation vector to the map, rad.
 
@@ -35,7 +49,7 @@ class Attitude(Kind):
     has_target = False
     noise, units = (0.02, 0.02, 0.05), ("rad", "rad", "rad")
     towards = ("map",)
-    in_warp = WarpFunctions(predict_attitude, sample_attitude)
+    in_warp = WarpFunctions(predict_attitude, sample_attitude, attitude_residual, derive_attitude)
 
     def predict(self, own: Placed, target: Placed) -> Array:
         """Return rotation vectors (..., 3), rad."""

@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from coopenv.estimation import linalg
 from coopenv.estimation.poses import Array, skew
-from coopenv.measurements.in_warp import first_three, joined
+from coopenv.measurements.in_warp import first_three, joined, rows_of
 from coopenv.measurements.kinds import Kind, Placed, WarpFunctions, derivatives, in_axes, unit
 
 
@@ -48,12 +49,31 @@ def sample_bearing(predicted: Any, noise: Any, like: Any):
     return joined(wp.normalize(u + noise[0] * first + noise[1] * second), like - like, predicted)
 
 
+@wp.func
+def bearing_residual(value: Any, predicted: Any, like: Any):
+    """Return the value in the tangent plane of the predicted direction, rad."""
+    first, second = axes_across(first_three(predicted, like))
+    measured = first_three(value, like)
+    return joined(type(like)(wp.dot(first, measured), wp.dot(second, measured), like.dtype(0.0)), like - like, value)
+
+
+@wp.func
+def derive_bearing(R: Any, p: Any, v: Any, target_R: Any, target_p: Any, target_v: Any):
+    """Return the derivatives in the tangent plane, see `Bearing.line`."""
+    d = wp.transpose(R) * (target_p - p)
+    u = wp.normalize(d)
+    first, second = axes_across(u)
+    plane = wp.matrix_from_rows(first, second, u - u)
+    shift = (plane * wp.transpose(R)) / wp.max(wp.length(d), d.dtype(1.0e-9))
+    return rows_of(plane * linalg.skew(u), -shift), rows_of(R - R, shift)
+
+
 class Bearing(Kind):
     """Direction to a target."""
 
     rows, size = 2, 3
     noise, units = (2.9e-3, 2.9e-3), ("rad", "rad")
-    in_warp = WarpFunctions(predict_bearing, sample_bearing)
+    in_warp = WarpFunctions(predict_bearing, sample_bearing, bearing_residual, derive_bearing)
     parts = (("", 3, "1"),)
 
     def predict(self, own: Placed, target: Placed) -> Array:

@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import quaternion_vector, rotation_vector_sine
+from coopenv.estimation.linalg import join6, quaternion_vector, rotation_vector_sine
 
 
 @wp.func
@@ -38,6 +38,24 @@ def rotation_vector(R: Any, like: Any):
             half_cosine = wp.sqrt(one - half_sine * half_sine)
         factor = factor * wp.atan2(half_sine, half_cosine) / half_sine
     return type(like)(q[0] * factor, q[1] * factor, q[2] * factor)
+
+
+@wp.func
+def rows_of(turn: Any, shift: Any):
+    """Return the derivative (6, 6) of three rows, by a turn (3, 3) and a shift (3, 3); the last rows are zero."""
+    return join6(turn, shift, turn - turn, turn - turn)
+
+
+@wp.func
+def first_row(a: Any):
+    """Return a matrix (3, 3) of zeros with a first row."""
+    return wp.matrix_from_rows(a, a - a, a - a)
+
+
+@wp.func
+def excess(value: Any, predicted: Any, like: Any):
+    """Return by how much six measured numbers exceed predicted ones."""
+    return value - predicted
 
 
 @wp.func

@@ -89,6 +89,11 @@ class WarpFunctions(NamedTuple):
     as the fields of `Placed`, rotations (3, 3), the others (3,)."""
     sample: Any
     """(predicted value, noise, a vector (3,) for its type): return the measured value."""
+    residual: Any = None
+    """(value, predicted value, a vector (3,) for its type): return the rows. None: no observer in kernels takes it."""
+    jacobian: Any = None
+    """(as `predict`, without the last): return the derivatives (6, 6) by errors of the sensor and of the target; rows
+    beyond the kind's are zero."""
 
 
 class Kind:
@@ -104,9 +109,9 @@ class Kind:
     noise: tuple[float, ...]  # (rows,) standard deviations where a scenario states no other
     units: tuple[str, ...]  # (rows,) of the residual
     towards: tuple[str, ...] = ("landmarks", "vehicles")  # what it measures where a scenario does not say
+    needs: tuple[str, ...] = ()  # "rotation" and "velocity": what it has to know of a target beside the position
     under_sky = False  # True: what hides the sky above it occludes it, as for a receiver of satellites
     in_warp: WarpFunctions | None = None  # None: it is computed in NumPy alone
-    needs: tuple[str, ...] = ()  # "rotation" and "velocity": what it has to know of a target beside the position
 
     def predict(self, own: Placed, target: Placed) -> Array:
         """Return values (..., size) without noise; `target` is the map's origin where the kind has no target."""

@@ -122,10 +122,10 @@ class OwnKind(Kind):
             change = self.own.residual(value, value) if hasattr(self.own, "residual") else value
             self.rows = max(1, np.size(change))
             self.noise = self._noise()
+            self.needs = self._needs(own, target) if self.has_target else ()
             if self.rows != self.size and not hasattr(self.own, "sample"):
                 sizes = f"predict returns {self.size} numbers and residual {self.rows}"
                 raise CoopenvError(f"sensor '{self.reference}': sample: missing; {sizes}")
-            self.needs = self._needs(own, target) if self.has_target else ()
             self.units = tuple(getattr(self.own, "units", ("1",) * self.rows))
             if hasattr(self.own, "jacobian"):
                 self._compare(own, target)

@@ -6,9 +6,9 @@ import numpy as np
 import warp as wp
 
 from coopenv.estimation.poses import Array
-from coopenv.measurements.bearing import Bearing, predict_bearing, sample_bearing
+from coopenv.measurements.bearing import Bearing, bearing_residual, derive_bearing, predict_bearing, sample_bearing
 from coopenv.measurements.kinds import Kind, Placed, WarpFunctions
-from coopenv.measurements.range import Range
+from coopenv.measurements.range import Range, derive_range
 
 BEARING, RANGE = Bearing(), Range()
 
@@ -29,12 +29,30 @@ def sample_range_bearing(predicted: Any, noise: Any, like: Any):
     return value
 
 
+@wp.func
+def range_bearing_residual(value: Any, predicted: Any, like: Any):
+    """Return rad, rad, m."""
+    rows = bearing_residual(value, predicted, like)
+    rows[2] = value[3] - predicted[3]
+    return rows
+
+
+@wp.func
+def derive_range_bearing(R: Any, p: Any, v: Any, target_R: Any, target_p: Any, target_v: Any):
+    """Return the derivatives of both parts."""
+    by_own, by_target = derive_bearing(R, p, v, target_R, target_p, target_v)
+    of_range, of_range_by_target = derive_range(R, p, v, target_R, target_p, target_v)
+    by_own[2] = of_range[0]
+    by_target[2] = of_range_by_target[0]
+    return by_own, by_target
+
+
 class RangeBearing(Kind):
     """Direction to a target, a unit vector, and its distance, m."""
 
     rows, size = 3, 4
     noise, units = (*BEARING.noise, *RANGE.noise), (*BEARING.units, *RANGE.units)
-    in_warp = WarpFunctions(predict_range_bearing, sample_range_bearing)
+    in_warp = WarpFunctions(predict_range_bearing, sample_range_bearing, range_bearing_residual, derive_range_bearing)
     parts = (("direction", 3, "1"), ("distance", 1, "m"))
 
     def predict(self, own: Placed, target: Placed) -> Array:

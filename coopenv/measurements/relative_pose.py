@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.estimation.linalg import exp_so3
+from coopenv.estimation import linalg
+from coopenv.estimation.linalg import exp_so3, identity3, join6
 from coopenv.estimation.poses import Array, skew
 from coopenv.measurements.in_warp import first_three, joined, last_three, rotation_vector
 from coopenv.measurements.kinds import (
@@ -34,14 +35,30 @@ def sample_relative_pose(predicted: Any, noise: Any, like: Any):
     return joined(place, rotation_vector(turned, like), predicted)
 
 
+@wp.func
+def relative_pose_residual(value: Any, predicted: Any, like: Any):
+    """Return m, and the rotation vector from the predicted orientation to the measured one, rad."""
+    turned = exp_so3(last_three(value, like)) * wp.transpose(exp_so3(last_three(predicted, like)))
+    return joined(first_three(value - predicted, like), rotation_vector(turned, like), predicted)
+
+
+@wp.func
+def derive_relative_pose(R: Any, p: Any, v: Any, target_R: Any, target_p: Any, target_v: Any):
+    """Return the derivatives, see `RelativePose.jacobian`."""
+    to_own = wp.transpose(R)
+    zero = R - R
+    turn = linalg.skew(to_own * (target_p - p))
+    return join6(turn, -to_own, -identity3(p), zero), join6(zero, to_own, to_own * target_R, zero)
+
+
 class RelativePose(Kind):
     """Position of a target, m, and its orientation, a rotation vector in rad, both in the sensor's axes."""
 
     rows = size = 6
     noise, units = (0.05,) * 3 + (0.02,) * 3, ("m",) * 3 + ("rad",) * 3
-    in_warp = WarpFunctions(predict_relative_pose, sample_relative_pose)
-    parts = (("position", 3, "m"), ("turn", 3, "rad"))
     needs = ("rotation",)
+    in_warp = WarpFunctions(predict_relative_pose, sample_relative_pose, relative_pose_residual, derive_relative_pose)
+    parts = (("position", 3, "m"), ("turn", 3, "rad"))
 
     def predict(self, own: Placed, target: Placed) -> Array:
         """Return (..., 6): position, m, and rotation vector, rad, NaN if the target's orientation is not known."""

@@ -17,6 +17,8 @@ call = Calls(
     {
         **{functions.predict: "33 3 3 33 3 3 6 > 6" for functions in IN_WARP.values()},
         **{functions.sample: "6 6 3 > 6" for functions in IN_WARP.values()},
+        **{functions.residual: "6 6 3 > 6" for functions in IN_WARP.values()},
+        **{functions.jacobian: "33 3 3 33 3 3 > 66 66" for functions in IN_WARP.values()},
     },
 )
 TOLERANCE = {"float64": 1e-12, "float32": 1e-4}
@@ -65,3 +67,24 @@ def test_noise_in_warp_acts_as_in_numpy(name: str, dtype: str) -> None:
     found = call(IN_WARP[name].sample, dtype, padded(predicted), padded(noise), np.zeros((1, 3)))
     assert_allclose(difference(kind, found, kind.sample(predicted, noise)), 0.0, atol=TOLERANCE[dtype])
     assert not found[:, kind.size :].any()
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_residual_in_warp_equals_the_kind_in_numpy(name: str, dtype: str) -> None:
+    kind = SHIPPED[name]
+    predicted = kind.predict(placed(1), placed(2))
+    value = kind.sample(predicted, 0.1 * np.random.default_rng(4).normal(size=(PLACES, kind.rows)))
+    found = call(IN_WARP[name].residual, dtype, padded(value), padded(predicted), np.zeros((1, 3)))
+    assert_allclose(found[:, : kind.rows], kind.residual(value, predicted), atol=TOLERANCE[dtype])
+    assert not found[:, kind.rows :].any()
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_derivatives_in_warp_equal_the_kind_in_numpy(name: str, dtype: str) -> None:
+    kind, own, target = SHIPPED[name], placed(1), placed(2)
+    poses = [part for of in (own, target) for part in (of.rotation, of.position, of.velocity)]
+    for found, expected in zip(call(IN_WARP[name].jacobian, dtype, *poses), kind.jacobian(own, target), strict=True):
+        assert_allclose(found[:, : kind.rows], expected, atol=TOLERANCE[dtype])
+        assert not found[:, kind.rows :].any()
