@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.poses import Array, skew
 
+MOST_ROWS = 6  # of a kind, and numbers of its value
 STEP = 1e-3
 """rad and m, of differences, whose error is of the fourth order: 1e-11 for a range of 50 m."""
 WEIGHTS = {1.0: 2.0 / 3.0, 2.0: -1.0 / 12.0}  # of central differences over one and two steps
@@ -77,6 +78,24 @@ def logarithm(R: Array) -> Array:
     return np.where(known[..., None], vectors.reshape(R.shape[:-1]), np.nan)
 
 
+class WarpFunctions(NamedTuple):
+    """A kind in kernels: Warp functions in any precision, in the conventions of `Kind`, of one measurement.
+
+    Values, noise and residuals are vectors of six numbers, zero beyond their size.
+    """
+
+    predict: Any
+    """(own rotation, position, velocity, target rotation, position, velocity, empty value): return the value; arguments
+    as the fields of `Placed`, rotations (3, 3), the others (3,)."""
+    sample: Any
+    """(predicted value, noise, a vector (3,) for its type): return the measured value."""
+    residual: Any = None
+    """(value, predicted value, a vector (3,) for its type): return the rows. None: no observer in kernels takes it."""
+    jacobian: Any = None
+    """(as `predict`, without the last): return the derivatives (6, 6) by errors of the sensor and of the target; rows
+    beyond the kind's are zero."""
+
+
 class Kind:
     """A kind of measurement; arrays may have leading axes (...) of a batch.
 
@@ -91,10 +110,17 @@ class Kind:
     units: tuple[str, ...]  # (rows,) of the residual
     towards: tuple[str, ...] = ("landmarks", "vehicles")  # what it measures where a scenario does not say
     needs: tuple[str, ...] = ()  # "rotation" and "velocity": what it has to know of a target beside the position
+    under_sky = False  # True: what hides the sky above it occludes it, as for a receiver of satellites
+    in_warp: WarpFunctions | None = None  # None: it is computed in NumPy alone
 
     def predict(self, own: Placed, target: Placed) -> Array:
         """Return values (..., size) without noise; `target` is the map's origin where the kind has no target."""
         raise NotImplementedError
+
+    @property
+    def parts(self) -> tuple[tuple[str, int, str], ...]:
+        """Name, size and unit of the parts of a value; one without a name is the whole value."""
+        return (("", self.size, self.units[0]),)
 
     def residual(self, value: Array, predicted: Array) -> Array:
         """Return (..., rows) by how much values exceed predicted ones, to first order linear in errors."""

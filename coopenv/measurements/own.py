@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from coopenv.base.errors import CoopenvError, error_text, shown
 from coopenv.base.installation import load_reference
 from coopenv.estimation.poses import Array
-from coopenv.measurements.kinds import Kind, Placed, exponential
+from coopenv.measurements.kinds import MOST_ROWS, Kind, Placed, exponential
 
-MOST_ROWS = 6
 AGREEMENT = 1e-4  # of a derivative with differences, relative to its largest entry
 TRIALS = 3  # places at which a kind is tried before it is used
 
@@ -38,6 +37,7 @@ class OwnKind(Kind):
         self.own = self._call("its start", made, **options)
         self.has_target = bool(getattr(made, "has_target", True))
         self.towards = tuple(getattr(made, "towards", Kind.towards if self.has_target else ("map",)))
+        self.in_warp = getattr(self.own, "in_warp", None)
         self._try()
 
     def predict(self, own: Placed, target: Placed) -> Array:
@@ -123,6 +123,9 @@ class OwnKind(Kind):
             self.rows = max(1, np.size(change))
             self.noise = self._noise()
             self.needs = self._needs(own, target) if self.has_target else ()
+            if self.rows != self.size and not hasattr(self.own, "sample"):
+                sizes = f"predict returns {self.size} numbers and residual {self.rows}"
+                raise CoopenvError(f"sensor '{self.reference}': sample: missing; {sizes}")
             self.units = tuple(getattr(self.own, "units", ("1",) * self.rows))
             if hasattr(self.own, "jacobian"):
                 self._compare(own, target)

@@ -1,9 +1,54 @@
 """Pose of a target in the sensor's axes: what a camera measures of a tag, or of a vehicle of known shape."""
 
-import numpy as np
+from typing import Any
 
+import numpy as np
+import warp as wp
+
+from coopenv.estimation import linalg
+from coopenv.estimation.linalg import exp_so3, identity3, join6
 from coopenv.estimation.poses import Array, skew
-from coopenv.measurements.kinds import Kind, Placed, derivatives, exponential, in_axes, logarithm
+from coopenv.measurements.in_warp import first_three, joined, last_three, rotation_vector
+from coopenv.measurements.kinds import (
+    Kind,
+    Placed,
+    WarpFunctions,
+    derivatives,
+    exponential,
+    in_axes,
+    logarithm,
+)
+
+
+@wp.func
+def predict_relative_pose(R: Any, p: Any, v: Any, target_R: Any, target_p: Any, target_v: Any, empty: Any):
+    """Return the target's position, m, and rotation vector, rad, in the sensor's axes."""
+    to_own = wp.transpose(R)
+    return joined(to_own * (target_p - p), rotation_vector(to_own * target_R, p), empty)
+
+
+@wp.func
+def sample_relative_pose(predicted: Any, noise: Any, like: Any):
+    """Return the shifted position and the orientation turned by the noise."""
+    turned = exp_so3(last_three(noise, like)) * exp_so3(last_three(predicted, like))
+    place = first_three(predicted, like) + first_three(noise, like)
+    return joined(place, rotation_vector(turned, like), predicted)
+
+
+@wp.func
+def relative_pose_residual(value: Any, predicted: Any, like: Any):
+    """Return m, and the rotation vector from the predicted orientation to the measured one, rad."""
+    turned = exp_so3(last_three(value, like)) * wp.transpose(exp_so3(last_three(predicted, like)))
+    return joined(first_three(value - predicted, like), rotation_vector(turned, like), predicted)
+
+
+@wp.func
+def derive_relative_pose(R: Any, p: Any, v: Any, target_R: Any, target_p: Any, target_v: Any):
+    """Return the derivatives, see `RelativePose.jacobian`."""
+    to_own = wp.transpose(R)
+    zero = R - R
+    turn = linalg.skew(to_own * (target_p - p))
+    return join6(turn, -to_own, -identity3(p), zero), join6(zero, to_own, to_own * target_R, zero)
 
 
 class RelativePose(Kind):
@@ -12,6 +57,8 @@ class RelativePose(Kind):
     rows = size = 6
     noise, units = (0.05,) * 3 + (0.02,) * 3, ("m",) * 3 + ("rad",) * 3
     needs = ("rotation",)
+    in_warp = WarpFunctions(predict_relative_pose, sample_relative_pose, relative_pose_residual, derive_relative_pose)
+    parts = (("position", 3, "m"), ("turn", 3, "rad"))
 
     def predict(self, own: Placed, target: Placed) -> Array:
         """Return (..., 6): position, m, and rotation vector, rad, NaN if the target's orientation is not known."""

@@ -75,7 +75,7 @@ class Sensor:
     @property
     def kind(self) -> Kind:
         """What it measures."""
-        return _kept_kind(self.reference, self.options)
+        return kept_kind(self.reference, self.options)
 
     def placed(self, R: Array, p: Array, velocity: Array, angular_velocity: Array, landmarks: Any = None) -> Placed:
         """Return where it is on a body at R (..., 3, 3), p (..., 3) with a twist (..., 3) in body axes."""
@@ -109,7 +109,8 @@ class Sensor:
 
 
 @cache
-def _kept_kind(reference: str, options: str) -> Kind:
+def kept_kind(reference: str, options: str) -> Kind:
+    """Return `kind_of`, made once."""
     return kind_of(reference, options)
 
 

@@ -1,21 +1,17 @@
 """What every vehicle of a simulated world knows before it starts: sensors, their noise, and the initial estimate."""
 
-import json
 import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError
 from coopenv.estimation import UNIFORM_ROTATION
 from coopenv.estimation.poses import Array, about_z
-from coopenv.measurements.sensor import MAP, Sensor, averaged_std, kind_of
+from coopenv.measurements.sensor import MAP, Sensor, averaged_std
 from coopenv.observers.contract import MIN_BEARING_STD, Gains, ObserverInit, SensorNoise, Setup
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets
-from coopenv.scenario.sensing import rotation_of
-from coopenv.scenario.sensors import SensorSection
 
 EXACT_START_STD = 1e-3  # rad and m, where a scenario starts its estimates at the truth
 
@@ -63,18 +59,12 @@ def sensors_of(scenario: Scenario, vehicle: int, neighbours: Sequence[int]) -> t
     """
     sensors = []
     for section in scenario.sensors:
-        if section.vehicles is not None and scenario.vehicle_names[vehicle] not in section.vehicles:
+        if not section.is_on(scenario.vehicle_names[vehicle]):
             continue
-        options = json.dumps(section.options, sort_keys=True)
-        kind = kind_of(section.kind, options)
-        white = np.atleast_1d(np.array(kind.noise if section.noise is None else section.noise, float))
-        if len(white) not in (1, kind.rows):
-            raise CoopenvError(f"sensors.{section.label}.noise: {len(white)} numbers for {kind.rows} rows")
+        kind, correlated = section.made, section.correlated
         period = 1.0 / min(section.rate or math.inf, scenario.rates.camera)
-        correlated = section.correlated
-        std = averaged_std(np.broadcast_to(white, kind.rows), correlated.std, correlated.time, period)
-        towards = kind.towards if section.towards is None else section.towards
-        found = [j for j in neighbours if kind.has_target and is_measured(scenario, towards, int(j))]
+        std = averaged_std(section.white, correlated.std, correlated.time, period)
+        found = [j for j in neighbours if section.measures(scenario, int(j))]
         sensors.append(
             Sensor(
                 name=section.label,
@@ -82,26 +72,11 @@ def sensors_of(scenario: Scenario, vehicle: int, neighbours: Sequence[int]) -> t
                 std=std if scenario.noise.enabled else np.full(kind.rows, MIN_BEARING_STD),
                 targets=np.array(found if kind.has_target else [MAP], np.int64),
                 position=np.array(section.position),
-                rotation=mounting_of(section),
-                options=options,
+                rotation=section.mounting,
+                options=section.arguments,
             )
         )
     return tuple(sensors)
-
-
-def mounting_of(section: SensorSection) -> Array:
-    """Return the rotation (3, 3) from a sensor to its body."""
-    turn = None if section.orientation == "body" else section.orientation
-    return np.asarray(rotation_of(None, turn))
-
-
-def is_measured(scenario: Scenario, towards: Sequence[str], target: int) -> bool:
-    """Return whether a target is among those that a sensor measures, by name, group or sort."""
-    marks = scenario.landmarks
-    if target >= len(marks):
-        return "vehicles" in towards or scenario.vehicle_names[target - len(marks)] in towards
-    mark = marks[target]
-    return bool({"anchors" if mark.anchor else "landmarks", mark.name, mark.group} & {*towards})
 
 
 def landmark_rotations(scenario: Scenario) -> Array:

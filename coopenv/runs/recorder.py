@@ -98,6 +98,7 @@ def record_episode(
         truth=Truth(episode["target_rotation"][:, L:], episode["target_position"][:, L:]),
         scenario=scenario,
         drawn=drawn,
+        readings={name: np.stack([tick.readings[name] for tick in ticks]) for name in ticks[0].readings},
         interference=stacked(faults),
         **kept,
     )

@@ -354,6 +354,8 @@ def _problems(s: Scenario) -> Iterator[str]:
 def _problems_of_nearby(s: Scenario) -> Iterator[str]:
     """Yield the reasons for which the agents in range of a vehicle are not limited."""
     key, listed = "topology.most_nearby", [vehicle.neighbours for vehicle in s.vehicles]
+    if s.sensors:
+        yield f"{key}: not with [[sensors]], whose measurements keep all targets"
     if s.action.radio or "seen" in s.observation.include:
         yield f"action.radio, observation.include: neither a radio action nor 'seen' with {key}"
     if None not in listed:

@@ -1,15 +1,23 @@
 """Sensors beside the camera: what each one measures, on which vehicles, towards what, and how well."""
 
+import json
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from coopenv.base import units
 from coopenv.base.errors import CoopenvError, check_one_of, shown
 from coopenv.base.installation import check_reference, is_reference
 from coopenv.base.sections import NonNegative, Positive, QuaternionWxyz, Rate, Section, Vector3
-from coopenv.measurements.kinds import KINDS
+from coopenv.estimation.poses import Array
+from coopenv.measurements.kinds import KINDS, Kind
+from coopenv.measurements.sensor import kept_kind
+from coopenv.scenario.sensing import rotation_of
+
+if TYPE_CHECKING:
+    from coopenv.scenario.schema import Scenario
 
 GROUPS = ("landmarks", "vehicles", "anchors", "map")
 """What a sensor may measure, beside single landmarks and vehicles by name."""
@@ -77,6 +85,44 @@ class SensorSection(Section):
     outliers: Outliers = Outliers()
     options: dict[str, Any] = Field(default={})
     """Arguments of a class of one's own."""
+
+    @property
+    def arguments(self) -> str:
+        """The options as JSON."""
+        return json.dumps(self.options, sort_keys=True)
+
+    @property
+    def made(self) -> Kind:
+        """Its kind. Raises CoopenvError: it cannot be used."""
+        return kept_kind(self.kind, self.arguments)
+
+    @property
+    def white(self) -> Array:
+        """(rows,) standard deviations of white noise. Raises CoopenvError: there are not as many as rows."""
+        rows = self.made.rows
+        given = np.atleast_1d(np.array(self.made.noise if self.noise is None else self.noise, float))
+        if len(given) not in (1, rows):
+            raise CoopenvError(f"sensors.{self.label}.noise: {len(given)} numbers for {rows} rows")
+        return np.broadcast_to(given, rows)
+
+    @property
+    def mounting(self) -> Array:
+        """(3, 3) sensor to body."""
+        return np.asarray(rotation_of(None, None if self.orientation == "body" else self.orientation))
+
+    def is_on(self, vehicle: str) -> bool:
+        """Return whether a vehicle of a name has it."""
+        return self.vehicles is None or vehicle in self.vehicles
+
+    def measures(self, scenario: "Scenario", target: int) -> bool:
+        """Return whether a target is among those that it measures, by name, group or sort."""
+        if not self.made.has_target:
+            return False
+        towards, marks = self.made.towards if self.towards is None else self.towards, scenario.landmarks
+        if target >= len(marks):
+            return "vehicles" in towards or scenario.vehicle_names[target - len(marks)] in towards
+        mark = marks[target]
+        return bool({"anchors" if mark.anchor else "landmarks", mark.name, mark.group} & {*towards})
 
     @property
     def label(self) -> str:
