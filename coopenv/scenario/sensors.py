@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -15,9 +15,6 @@ from coopenv.estimation.poses import Array
 from coopenv.measurements.kinds import KINDS, Kind
 from coopenv.measurements.sensor import kept_kind
 from coopenv.scenario.sensing import rotation_of
-
-if TYPE_CHECKING:
-    from coopenv.scenario.schema import Scenario
 
 GROUPS = ("landmarks", "vehicles", "anchors", "map")
 """What a sensor may measure, beside single landmarks and vehicles by name."""
@@ -114,7 +111,7 @@ class SensorSection(Section):
         """Return whether a vehicle of a name has it."""
         return self.vehicles is None or vehicle in self.vehicles
 
-    def measures(self, scenario: "Scenario", target: int) -> bool:
+    def measures(self, scenario: Any, target: int) -> bool:
         """Return whether a target is among those that it measures, by name, group or sort."""
         if not self.made.has_target:
             return False

@@ -289,3 +289,29 @@ def test_a_limit_of_nearby_targets_is_refused_with_sensors() -> None:
     topology = {"mode": "sensed", "most_nearby": 3}
     with pytest.raises(ScenarioError, match=r"topology\.most_nearby: not with \[\[sensors\]\]"):
         sensing({"kind": "range"}, topology=topology)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_gramian_has_the_information_of_every_kind(kind: str) -> None:
+    """By differences of the kind's prediction in NumPy, in the error (phi, d) of the map about its origin."""
+    sensor = {"kind": kind, "name": "own", "towards": ["landmarks"], "noise": 0.05, **MOUNTING}
+    exact = {"initial_estimate": {"orientation_angle": 0.0, "position_radius": 0.0}}
+    car = vehicle((1.0, -1.0, 0.5), motion=constant([0.3, 0.0, 0.0], [0.0, 0.0, 0.2]), **exact)
+    bearing = {"model": "isotropic", "scale": 0.01, "rate": 60.0}
+    noise = {"enabled": False, "bearing": bearing}
+    world = world_of(sensing(sensor, vehicles=[car], noise=noise, camera={"model": "none"}))
+    made: Kind = kept_kind(kind, "{}")
+    expected = np.zeros((6, 6))
+    for target in range(4) if made.has_target else [0]:
+        own, there = places(world, 0, target, sensor)
+        value, columns = made.predict(own, there), []
+        for axis in np.eye(6):
+            turn, shift = 1e-6 * axis[:3], 1e-6 * axis[3:]
+            R = np.eye(3) + np.cross(np.eye(3), turn)
+            moved = Placed(own.position + np.cross(turn, own.position) + shift, R @ own.rotation, own.velocity, turn)
+            columns.append(made.residual(made.predict(moved, there), value) / 1e-6)
+        H = np.stack(columns, axis=-1)
+        expected += H.T @ H * (0.01 / 0.05) ** 2
+    found = {n: world.view(f"information_{n}")[0, 0, 0] for n in ("11", "12", "22")}
+    whole = np.block([[found["11"], found["12"]], [found["12"].T, found["22"]]])
+    assert_allclose(whole, expected, atol=2e-5 * max(1.0, np.abs(expected).max()))
