@@ -17,7 +17,7 @@ from coopenv.measurements.sensor import kept_kind
 from coopenv.scenario.sensing import rotation_of
 
 GROUPS = ("landmarks", "vehicles", "anchors", "map")
-"""What a sensor may measure, beside single landmarks and vehicles by name."""
+"""Targets of a sensor, beside single landmarks and vehicles by name."""
 MOST_SENSORS = 16
 
 
@@ -57,7 +57,7 @@ class SensorSection(Section):
     vehicles: tuple[str, ...] | None = None
     """Names of the vehicles that have it (default: all)."""
     towards: tuple[str, ...] | None = None
-    """What it measures: `landmarks`, `vehicles`, `anchors` (landmarks for radios, which cameras do not see), `map`, and
+    """Its targets: `landmarks`, `vehicles`, `anchors` (landmarks for radios, which cameras do not see), `map`, and
     names of landmarks, groups and vehicles (default: the kind's own)."""
     rate: Annotated[Rate | None, units.FREQUENCY] = None
     """Measurements per second, at the nearest camera ticks (none: at every tick)."""

@@ -421,7 +421,7 @@ def state_sizes(model: Any, worlds: int) -> dict[str, int]:
     grid = {"G": model.cells.across**2, "I": model.agents + model.traffic}
     ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
     draws = {
-        "R": model.sensor.shape[0],
+        "R": 0 if model.sensor is None else model.sensor.shape[0],
         "P": model.routes.points,
         "Q": len(PARAMETERS),
         "Z": model.traffic,
