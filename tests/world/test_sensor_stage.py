@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from coopenv.api.engine import Engine
+from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import CoopenvError, ScenarioError
 from coopenv.measurements.kinds import KINDS, Kind, Placed
 from coopenv.measurements.sensor import kept_kind
@@ -189,6 +191,17 @@ def test_cameras_see_neither_anchors_nor_anything_without_a_camera() -> None:
     for camera, seen in (({}, [True, True, True, False, False]), ({"model": "none"}, [False] * 5)):
         world = world_of(sensing(vehicles=[vehicle()], landmarks=MARKS, camera=camera))
         assert_array_equal(world.sensed(0, 0).visible[0], seen)
+
+
+def test_maps_expect_neither_anchors_nor_anything_without_a_camera() -> None:
+    for camera, seen in (({}, 3), ({"model": "none"}, 0)):
+        description = sensing(
+            vehicles=[vehicle()], landmarks=MARKS, camera=camera, observation={"include": ["map"], "map_size": 4}
+        )
+        engine = Engine(description, 1, "float64")
+        engine.reset([0])
+        field = observation_layout(description)["map_in_view"]
+        assert field.values(engine.view("observation")[0, 0]).sum() == seen
 
 
 def test_ideal_sensing_measures_everything_and_blind_sensing_nothing() -> None:
