@@ -72,7 +72,7 @@ class SensorSection(Section):
     field_of_view: Annotated[Positive | None, units.HEADING] = None
     """Full angle of the cone about the sensor's x axis in which targets lie, rad (none: every direction)."""
     occluded: bool = True
-    """Whether buildings and bodies between it and a target hide the target; for `position`, buildings above the sky."""
+    """Whether buildings and bodies hide a target behind them, and buildings above a receiver of `position` the sky."""
     miss_probability: units.Chance = 0.0
     """Chance that a measurement is lost, drawn per target and measurement."""
     bias: NonNegative = 0.0
