@@ -420,14 +420,9 @@ def state_sizes(model: Any, worlds: int) -> dict[str, int]:
     }
     grid = {"G": model.cells.across**2, "I": model.agents + model.traffic}
     ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
-    draws = {
-        "R": 0 if model.sensor is None else model.sensor.shape[0],
-        "P": model.routes.points,
-        "Q": len(PARAMETERS),
-        "Z": model.traffic,
-        "U": model.action_size,
-    }
-    return {"W": worlds, "A": A, "N": N, "L": N, "R": model.sensor.shape[0], **draws, **ticks, **grid, **near}
+    draws = {"P": model.routes.points, "Q": len(PARAMETERS), "Z": model.traffic, "U": model.action_size}
+    sensors = 0 if model.sensor is None else model.sensor.shape[0]
+    return {"W": worlds, "A": A, "N": N, "L": N, "R": sensors, **draws, **ticks, **grid, **near}
 
 
 def allocate_state(model: Any, worlds: int, p: Precision, device: str, shared: str = "") -> Any:
