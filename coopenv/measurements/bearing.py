@@ -74,6 +74,7 @@ class Bearing(Kind):
     rows, size = 2, 3
     noise, units = (2.9e-3, 2.9e-3), ("rad", "rad")
     in_warp = WarpFunctions(predict_bearing, sample_bearing, bearing_residual, derive_bearing)
+    parts = (("", 3, "1"),)
 
     def predict(self, own: Placed, target: Placed) -> Array:
         """Return unit vectors (..., 3) from the sensor to the target, the sensor's axes."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,12 +110,18 @@ class Kind:
     units: tuple[str, ...]  # (rows,) of the residual
     towards: tuple[str, ...] = ("landmarks", "vehicles")  # what it measures where a scenario does not say
     needs: tuple[str, ...] = ()  # "rotation" and "velocity": what it has to know of a target beside the position
+    drawn: Literal["line", "none"] = "line"  # how pictures show a measurement: a line to its target, or not
     under_sky = False  # True: what hides the sky above it occludes it, as for a receiver of satellites
     in_warp: WarpFunctions | None = None  # None: it is computed in NumPy alone
 
     def predict(self, own: Placed, target: Placed) -> Array:
         """Return values (..., size) without noise; `target` is the map's origin where the kind has no target."""
         raise NotImplementedError
+
+    @property
+    def parts(self) -> tuple[tuple[str, int, str], ...]:
+        """Name, size and unit of the parts of a value; one without a name is the whole value."""
+        return (("", self.size, self.units[0]),)
 
     def residual(self, value: Array, predicted: Array) -> Array:
         """Return (..., rows) by how much values exceed predicted ones, to first order linear in errors."""

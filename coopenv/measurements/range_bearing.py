@@ -53,6 +53,7 @@ class RangeBearing(Kind):
     rows, size = 3, 4
     noise, units = (*BEARING.noise, *RANGE.noise), (*BEARING.units, *RANGE.units)
     in_warp = WarpFunctions(predict_range_bearing, sample_range_bearing, range_bearing_residual, derive_range_bearing)
+    parts = (("direction", 3, "1"), ("distance", 1, "m"))
 
     def predict(self, own: Placed, target: Placed) -> Array:
         """Return (..., 4): the unit vector in the sensor's axes and the distance, m."""

@@ -58,6 +58,7 @@ class RelativePose(Kind):
     noise, units = (0.05,) * 3 + (0.02,) * 3, ("m",) * 3 + ("rad",) * 3
     needs = ("rotation",)
     in_warp = WarpFunctions(predict_relative_pose, sample_relative_pose, relative_pose_residual, derive_relative_pose)
+    parts = (("position", 3, "m"), ("turn", 3, "rad"))
 
     def predict(self, own: Placed, target: Placed) -> Array:
         """Return (..., 6): position, m, and rotation vector, rad, NaN if the target's orientation is not known."""

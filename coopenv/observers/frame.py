@@ -220,7 +220,7 @@ def linearised(pose: UncertainPose, tick: Tick, measured: UsableMeasurements) ->
     if measured.others is None:
         return LinearMeasurements(*linearise(pose.R, pose.p, pose.kind == RIGHT, *frame_of(tick, measured)))
     kinds = {number: tick.readings[number].sensor.kind for number in {*measured.others.sensor.tolist()} - {CAMERA}}
-    r = max([kind.rows for kind in kinds.values()] + [BEARING_ROWS] * bool((measured.others.sensor == CAMERA).any()))
+    r = max([BEARING_ROWS, *(kind.rows for kind in kinds.values())])
     m = len(measured.targets)
     linear = LinearMeasurements(
         np.zeros((m, r)),

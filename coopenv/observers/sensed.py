@@ -17,6 +17,7 @@ from coopenv.measurements.sensor import Reading, Sensor
 from coopenv.observers.arrays import ARRAYS, KINDS_OF_TICKS, invalid_rows, misshapen, sizes_of
 from coopenv.observers.contract import ObserverInit, Received, Setup, Tick, sealed
 from coopenv.observers.faults import Interference
+from coopenv.observers.readings import problems_of_readings
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,10 @@ class Measurements:
     def measured(self) -> dict[str, Array]:
         """Return the arrays of this class that are there, by name."""
         return {name: value for name in MEASURED if (value := getattr(self, name)) is not None}
+
+    def readings_at(self, ticks: Any) -> dict[str, Array]:
+        """Return the readings of one or some of several ticks."""
+        return {name: values[ticks] for name, values in self.readings.items()}
 
     def filled(self, name: str) -> NDArray[Any]:
         """Return an array; if it is absent, one of the value that stands for it."""
@@ -152,6 +157,8 @@ def check_tick(tick: Sensed, index: int, observer_init: ObserverInit) -> None:
     for problem in misshapen(given, sizes_of(observer_init.setups), KINDS_OF_TICKS):
         raise CoopenvError(f"tick {index}: {problem}")
     absent = given.get("missing", np.zeros(len(observer_init.setups), bool))
+    for problem in problems_of_readings(tick.readings, observer_init.setups, ignored=np.asarray(absent)):
+        raise CoopenvError(f"tick {index}: {problem}")
     seen = tick.visible & ~absent[:, None]
     given |= {"visible": seen, "bearings": np.where(seen[..., None], tick.bearings, np.nan)}
     problems = invalid_rows(given, {"now": index, "period": 1}, ticks=False)

@@ -355,6 +355,9 @@ def state_struct(p: Precision) -> Any:
 
         reading: array("WNRX", vec6)  # last value of a sensor beside the camera; of the map: in the first entry
         reading_tick: array("WNRX", wp.int32, TICK)  # tick of that value; -1: never
+        information_11: array("WNR", mat33)  # C^T C of a sensor's measurements at this tick, map axes
+        information_12: array("WNR", mat33)
+        information_22: array("WNR", mat33)
         sensor_drift: array("WNR", vec6, TRUTH)  # truth: correlated error of its rows
         sensor_outage: array("WNR", wp.int32, FLAG)  # truth: 1: it measures nothing for a while
 
@@ -420,7 +423,7 @@ def state_sizes(model: Any, worlds: int) -> dict[str, int]:
     grid = {"G": model.cells.across**2, "I": model.agents + model.traffic}
     ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
     draws = {
-        "R": model.sensor.shape[0],
+        "R": 0 if model.sensor is None else model.sensor.shape[0],
         "P": model.routes.points,
         "Q": len(PARAMETERS),
         "Z": model.traffic,

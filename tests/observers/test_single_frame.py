@@ -196,7 +196,7 @@ def test_first_estimates_are_the_filter_in_transformed_coordinates() -> None:
         def reset(self, poses, covariances) -> None:  # type: ignore[no-untyped-def]
             super().reset(poses, covariances)
             for gate in self.gates:
-                gate.passed = lambda time, residual, S, front: np.ones(len(residual), bool)  # type: ignore[method-assign]
+                gate.passed = lambda time, linear, S: np.ones(len(linear.residual), bool)  # type: ignore[method-assign]
 
     R, p = made.start_rotation.copy(), made.start_position.copy()
     axes = block_diag(*[block_diag(x, x) for x in R])

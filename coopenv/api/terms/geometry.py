@@ -307,6 +307,8 @@ def expected_in_view(model: Any, state: Any, world: int, vehicle: int, point: An
 
     It is in range, in the image, and occluded by no building and no vehicle at the pose of its last message.
     """
+    if model.camera[vehicle].absent == 1:
+        return False
     if model.sensed == 0:
         return True
     R = state.estimate_rotation[world, vehicle]
@@ -385,7 +387,8 @@ def next_landmark(model: Any, state: Any, world: int, vehicle: int, last: MapLan
         point = mapped_position(model, state, world, vehicle, landmark.index)
         landmark.exists = True
         landmark.position = wp.vec3(wp.transpose(R) * point - state.estimate_position[world, vehicle])
-        landmark.expected = expected_in_view(model, state, world, vehicle, point)
+        if model.scene.anchor[landmark.index] == 0:
+            landmark.expected = expected_in_view(model, state, world, vehicle, point)
         entry = entry_of(model, state, world, vehicle, landmark.index)
         if entry >= 0:
             landmark.in_view = state.sight[world, vehicle, entry] == VISIBLE
