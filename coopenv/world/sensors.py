@@ -13,9 +13,9 @@ import numpy as np
 import warp as wp
 
 from coopenv.estimation import Sight
-from coopenv.measurements.kinds import KINDS, MOST_ROWS, WarpFunctions
 from coopenv.estimation.poses import Array
 from coopenv.measurements.bearing import Bearing
+from coopenv.measurements.kinds import KINDS, MOST_ROWS, WarpFunctions
 from coopenv.scenario import Scenario
 from coopenv.scenario.sensors import SensorSection
 from coopenv.world.camera import behind_building, inverse_square_of, marker_position, occlusion

@@ -288,8 +288,8 @@ def memory_struct(entries: str, of_reading: Any) -> Any:
         outbox_correlation: array("WNSC", Correlation)
         correlation: array("WNYC", Correlation)  # per receiver and box
         known: array("WLK", Regressor)
-        reading: array("WL" + entries, of_reading)  # of which sensor beside the camera a measurement is, see readings.py
-        reading_tick: array("WNR", wp.int32)  # of the last frame with measurements of a sensor; -1: none yet
+        reading: array("WL" + entries, of_reading)  # of measurements of sensors beside the camera, see readings.py
+        reading_tick: array("WNR", wp.int32)  # of the last frame with measurements of a sensor; -1: none
         factor: array("WLKK", mat66d)  # blocks of a Cholesky factor, on its diagonal their inverses
 
     return RobustMemory

@@ -45,7 +45,7 @@ from coopenv.observers.robust.sources import is_excluded, take_slot
 from coopenv.world.camera import mapped_position
 from coopenv.world.model import STATIC
 from coopenv.world.nearby import box_of_entry
-from coopenv.world.warp_internals import device_function, overload_of, subroutine
+from coopenv.world.warp_internals import device_function, overload_of
 
 NAMES = list(KINDS)
 BEARING, RANGE_BEARING, RELATIVE_POSE = (NAMES.index(name) for name in ("bearing", "range_bearing", "relative_pose"))
