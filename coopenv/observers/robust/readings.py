@@ -152,7 +152,7 @@ def add_readings(memory: RobustMemory, model: Any, state: Any, world: int, i: in
 
 
 @overload_of(add_readings, subroutine=True)
-def add_readings_in_all(
+def add_readings_with_sensors(
     memory: RobustMemoryWithReadings, model: Any, state: Any, world: int, i: int, frame: BearingFrame
 ) -> int:
     """Add the measurements of other sensors to the frame's bearings; return the number of all."""
@@ -194,7 +194,7 @@ def is_reading(memory: RobustMemory, world: int, i: int, n: Any) -> bool:
 
 
 @overload_of(is_reading)
-def is_reading_in_all(memory: RobustMemoryWithReadings, world: int, i: int, n: Any) -> bool:
+def is_reading_with_sensors(memory: RobustMemoryWithReadings, world: int, i: int, n: Any) -> bool:
     """Return whether a measurement is one of a sensor beside the camera."""
     return memory.reading[world, i, n].part >= 0
 
@@ -206,7 +206,7 @@ def unused_rows(memory: RobustMemory, world: int, i: int, count: Any) -> int:
 
 
 @overload_of(unused_rows)
-def unused_rows_in_all(memory: RobustMemoryWithReadings, world: int, i: int, count: Any) -> int:
+def unused_rows_with_sensors(memory: RobustMemoryWithReadings, world: int, i: int, count: Any) -> int:
     """Return how many rows of the measurements that fit were not measured."""
     unused = int(0)
     for n in range(count):
@@ -222,7 +222,7 @@ def linearise_reading(memory: RobustMemory, world: int, i: int, n: Any) -> bool:
 
 
 @overload_of(linearise_reading, subroutine=True)
-def linearise_reading_in_all(memory: RobustMemoryWithReadings, world: int, i: int, n: Any) -> bool:
+def linearise_reading_with_sensors(memory: RobustMemoryWithReadings, world: int, i: int, n: Any) -> bool:
     """Linearise the n-th measurement, one of another sensor; return whether its target is ahead of the sensor."""
     member = memory.measurement[world, i, n].member
     point = memory.measurement[world, i, n].point
@@ -269,8 +269,11 @@ def linearise_reading_in_all(memory: RobustMemoryWithReadings, world: int, i: in
             scale = wp.float64(1.0) / wp.sqrt(std * std + variance)
             own_turn = mounted * turn - wp.transpose(arm) * shift
             own_shift = wp.transpose(own.R) * shift
-            member_turn = memory.reading[world, i, n].turn * their_turn - wp.transpose(reach) * their_shift
-            member_shift = wp.transpose(theirs_R) * their_shift
+            member_turn = vec3d()
+            member_shift = vec3d()
+            if member > 0:
+                member_turn = memory.reading[world, i, n].turn * their_turn - wp.transpose(reach) * their_shift
+                member_shift = wp.transpose(theirs_R) * their_shift
             total = residual[row] + wp.length_sq(own_turn) + wp.length_sq(member_turn)
             if wp.isfinite(total + wp.length_sq(own_shift) + wp.length_sq(member_shift)):
                 r[k] = scale * residual[row]

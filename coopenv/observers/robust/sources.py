@@ -37,7 +37,9 @@ def is_seen(memory: RobustMemory, state: Any, world: int, i: int, entry: int, ti
 
 
 @overload_of(is_seen)
-def is_seen_in_all(memory: RobustMemoryWithReadings, state: Any, world: int, i: int, entry: int, tick: int) -> bool:
+def is_seen_with_sensors(
+    memory: RobustMemoryWithReadings, state: Any, world: int, i: int, entry: int, tick: int
+) -> bool:
     """Return whether the target of an entry is measured at a tick, by the camera or by another sensor."""
     for sensor in range(state.reading_tick.shape[2]):
         if state.reading_tick[world, i, sensor, entry] == tick:

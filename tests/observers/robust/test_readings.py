@@ -44,7 +44,7 @@ from tests.helpers.robust_ticks import (
 AT: Pose = displaced((np.eye(3), np.zeros(3)), np.array([0.3, -0.2, 1.1, 0.5, -0.4, 0.2]))
 LANDMARK_ROTATION = about_z(np.array([0.3, -1.0, 2.0, 0.0, 3.0]))
 MOUNTED = displaced((np.eye(3), np.zeros(3)), np.array([0.2, -0.5, 0.4, 0.4, -0.2, 0.3]))
-STD = {"bearing": 0.003, "range": 0.1, "position": 0.4, "attitude": 0.02, "relative_pose": 0.03}
+STD = {"bearing": 0.003, "range": 0.02, "position": 0.03, "attitude": 0.005, "relative_pose": 0.03}
 SENDER = len(LANDMARKS) + 1
 
 
@@ -212,7 +212,10 @@ def test_ranges_between_vehicles_halve_the_error_at_the_end_of_the_chain() -> No
     assert (result.anees(10.0) > 0.4).all() and (result.anees(10.0) < 1.6).all()
 
 
-BLIND = {"position and attitude": [{"kind": "position"}, {"kind": "attitude"}], "relative pose": [{"kind": "relative_pose"}]}
+BLIND = {
+    "position and attitude": [{"kind": "position"}, {"kind": "attitude"}],
+    "relative pose": [{"kind": "relative_pose"}],
+}
 
 
 @pytest.mark.parametrize("name", BLIND)
