@@ -16,7 +16,6 @@ from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import about_z
 from coopenv.measurements.kinds import KINDS, Placed
 from coopenv.measurements.sensor import MAP, Reading, Sensor, kind_of
-from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.robust.observer import ROBUST, WITH_READINGS
 from coopenv.runs.recorder import record
@@ -200,7 +199,9 @@ def test_worlds_get_the_kernels_that_they_need(sensors: Any, variant: Any) -> No
 
 def test_a_class_of_one_s_own_is_refused_in_one_line() -> None:
     own = Sensor("own", "tests.helpers.doppler:Doppler", np.ones(1), np.array([0]), np.zeros(3), np.eye(3))
-    with pytest.raises(CoopenvError, match="observer 'robust' takes the kinds bearing, range,.* no class of one's own"):
+    with pytest.raises(
+        CoopenvError, match=r"observer 'robust' takes the kinds bearing, range,.* no class of one's own"
+    ):
         OpenRobust(replace(known(), sensors=(own,)))
 
 
