@@ -1,6 +1,7 @@
 """Sensors beside the camera: what each one measures, on which vehicles, towards what, and how well."""
 
 import json
+import math
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, Literal, Self
 
@@ -13,7 +14,7 @@ from coopenv.base.installation import check_reference, is_reference
 from coopenv.base.sections import NonNegative, Positive, QuaternionWxyz, Rate, Section, Vector3
 from coopenv.estimation.poses import Array
 from coopenv.measurements.kinds import KINDS, Kind
-from coopenv.measurements.sensor import kept_kind
+from coopenv.measurements.sensor import averaged_std, kept_kind
 from coopenv.scenario.sensing import rotation_of
 
 GROUPS = ("landmarks", "vehicles", "anchors", "map")
@@ -101,6 +102,11 @@ class SensorSection(Section):
         if len(given) not in (1, rows):
             raise CoopenvError(f"sensors.{self.label}.noise: {len(given)} numbers for {rows} rows")
         return np.broadcast_to(given, rows)
+
+    def counted(self, camera: float) -> Array:
+        """Return standard deviations (rows,) by which filters count its noise; `camera` is the rate of ticks, Hz."""
+        period = 1.0 / min(self.rate or math.inf, camera)
+        return averaged_std(self.white, self.correlated.std, self.correlated.time, period)
 
     @property
     def mounting(self) -> Array:

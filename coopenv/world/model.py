@@ -262,9 +262,12 @@ def model_struct(p: Precision) -> Any:
 
         rotation: mat33  # sensor to body
         position: vec3  # body frame, m
+        kind: wp.int32  # its place in `coopenv.measurements.kinds.KINDS`; -1: a class of one's own
+        rows: wp.int32
         has_target: wp.int32  # 0: it measures the map
         ratio: wp.float64  # measurements per tick, at most 1
         std: vec6  # of white noise
+        counted: vec6  # standard deviations by which filters count its noise
         weight: vec6  # of rows in the sliding Gramian, relative to a bearing of the camera
         bias: vec6  # standard deviations of an error per vehicle and episode
         correlated: vec6  # standard deviations of a Gauss-Markov process

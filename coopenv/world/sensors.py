@@ -15,7 +15,7 @@ import warp as wp
 from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array
 from coopenv.measurements.bearing import Bearing
-from coopenv.measurements.kinds import MOST_ROWS, WarpFunctions
+from coopenv.measurements.kinds import KINDS, MOST_ROWS, WarpFunctions
 from coopenv.scenario import Scenario
 from coopenv.scenario.sensors import SensorSection
 from coopenv.world.camera import behind_building, inverse_square_of, marker_position, occlusion
@@ -51,9 +51,12 @@ def sensor_entries(section: SensorSection, scenario: Scenario) -> dict[str, Any]
     return {
         "rotation": section.mounting,
         "position": section.position,
+        "kind": [*KINDS].index(section.kind) if section.kind in KINDS else -1,
+        "rows": kind.rows,
         "has_target": kind.has_target,
         "ratio": min(1.0, (section.rate or camera) / camera),
         "std": on * np.pad(section.white, (0, MOST_ROWS - kind.rows)),
+        "counted": on * np.pad(section.counted(camera), (0, MOST_ROWS - kind.rows)),
         "weight": _weights(section, scenario),
         "bias": on * section.bias * rows,
         "correlated": on * correlated.std * rows,

@@ -2,10 +2,10 @@
 
 W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders), M odometry samples a tick, S slots of
 the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q parameters, U numbers of an action, Z bodies
-of the traffic, G cells of the grid, I items in it. Measurements and messages have
-X entries, one per agent, and Y boxes, one per sender, or as many as are kept (V), see `coopenv.world.nearby`; E agents
-that may be off on maps. R sensors beside the camera. L lanes of scratch: indexed by vehicle, shared by the vehicles
-that one thread takes in turn.
+of the traffic, G cells of the grid, I items in it. Measurements and messages have X entries, one per agent, and Y
+boxes, one per sender, or as many as are kept (V), see `coopenv.world.nearby`; E agents that may be off on maps. R
+sensors beside the camera; F measurements of a frame at most, in pairs of rows. L lanes of scratch: indexed by vehicle,
+shared by the vehicles that one thread takes in turn.
 
 A field of a record states its axes once, a letter each, and is allocated by them. It also states the rule of its saved
 values; all rules are checked before anything is restored.
@@ -24,6 +24,7 @@ from coopenv.base.sections import LARGEST
 from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import Fields, Mask, Rule, are_covariances, are_rotations, are_unit_vectors, everywhere
+from coopenv.measurements.kinds import MOST_ROWS
 from coopenv.scenario.difficulty import MOST, PARAMETERS
 from coopenv.world.model import Precision
 from coopenv.world.warp_internals import field_types, struct_of
@@ -44,6 +45,7 @@ def fields(record: Any) -> dict[str, Any]:
     return {name: kind for name, kind in field_types(record).items() if hasattr(kind, "axes")}
 
 
+PAIRS_OF_ROWS = MOST_ROWS // 2  # of a measurement
 SCRATCH = "L"
 """The second axis of scratch."""
 
@@ -422,7 +424,8 @@ def state_sizes(model: Any, worlds: int) -> dict[str, int]:
     ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
     draws = {"P": model.routes.points, "Q": len(PARAMETERS), "Z": model.traffic, "U": model.action_size}
     sensors = 0 if model.sensor is None else model.sensor.shape[0]
-    return {"W": worlds, "A": A, "N": N, "L": N, "R": sensors, **draws, **ticks, **grid, **near}
+    rows = {"R": sensors, "F": near["X"] * (1 + PAIRS_OF_ROWS * sensors)}
+    return {"W": worlds, "A": A, "N": N, "L": N, **rows, **draws, **ticks, **grid, **near}
 
 
 def allocate_state(model: Any, worlds: int, p: Precision, device: str, shared: str = "") -> Any:
