@@ -13,8 +13,10 @@ PACKAGE = Path(__file__).resolve().parents[1] / "coopenv"
 ROOMS = (
     ("base",),
     ("report",),
+    ("motions.table",),
     ("scenario",),
     ("estimation",),
+    ("motions",),
     ("world",),
     ("observers",),
     ("sources", "backends"),

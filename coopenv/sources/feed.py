@@ -304,7 +304,7 @@ def take_pose(model: Any, state: Any, motion: Any, world: int, vehicle: int):
     """Write the true pose and twist of a vehicle; the twist holds for all odometry samples of the tick."""
     recall_truth(model, state, motion, world, vehicle, world)
     state.speed[world, vehicle] = motion.speed[world, vehicle]
-    state.steering[world, vehicle] = motion.steering[world, vehicle]
+    state.turn[world, vehicle] = motion.steering[world, vehicle]
     if motion.left[world, vehicle] != 0:
         state.present[world, model.landmarks + vehicle] = 0
     for sample in range(model.samples_per_tick):

@@ -11,6 +11,7 @@ from coopenv.base.errors import ScenarioError
 from coopenv.base.sections import Section
 from coopenv.estimation import KINDS, Outcome
 from coopenv.estimation.lens import largest_radius
+from coopenv.motions.table import DRIVES, MOTIONS, columns_of
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.difficulty import FASTEST_PACE, PARAMETERS
@@ -259,6 +260,7 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "samples_per_tick": math.ceil(rates.odometry / rates.camera - 1e-9) + 1,
         "ticks_per_decision": scenario.ticks_per_decision,
         "action_size": scenario.action_size,
+        "columns": scenario.columns,
         "pans": scenario.action.pan is not None,
         "horizon_ticks": scenario.horizon_ticks,
         "kept": kept,
@@ -330,13 +332,23 @@ def _motion(scenario: Scenario) -> dict[str, Any]:
 
 def _dynamics(d: Dynamics, scenario: Scenario, traffic: bool) -> dict[str, Any]:
     accelerates, pan = scenario.action.longitudinal == "acceleration", scenario.action.pan
+    kind = d.model if d.model in DRIVES else DRIVES[0]  # a drive of the user's own is moved on the host
+    change, lag = (getattr(d, key) for key in MOTIONS[kind].turning)
+    speed, turn, *others = columns_of(d)
     return {
-        "min_speed": -d.max_speed if d.reverse else 0.0,
+        "kind": DRIVES.index(kind),
+        "min_speed": speed.low,
+        "max_speed": speed.high,
+        "steers": turn.unit == "rad",
+        "max_turn": turn.high,
+        "max_turn_change": change,
+        "turn_time_constant": lag,
+        "max_lateral_speed": others[0].high if others else 0.0,
         "speed_time_constant": 0.0 if accelerates or traffic else d.speed_time_constant,  # an acceleration acts at once
         "in_traffic": traffic,
         "latency_ticks": round(d.latency * scenario.rates.camera),
         "acceleration_mode": accelerates,
-        "action_steering": scenario.action.steering or d.max_steering,
+        "action_turn": scenario.action.at_one(turn),
         "pan_limit": pan.limit if pan else 0.0,
         "pan_rate": pan.rate if pan else 0.0,
     }
@@ -396,7 +408,7 @@ def _cells(scenario: Scenario) -> dict[str, Any]:
 def _radio(scenario: Scenario) -> dict[str, Any]:
     return {
         "connected": [vehicle.connected for vehicle in scenario.vehicles],
-        "entry": (2 if scenario.action.pan is None else 3) if scenario.action.radio else 0,
+        "entry": scenario.columns + (scenario.action.pan is not None) if scenario.action.radio else 0,
         "to_all": scenario.v2x.links == "all",
         "slots": max(scenario.v2x.delay, 1) + 1 + scenario.replay_ticks,
     }
