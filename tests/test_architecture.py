@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "coopenv"
 ROOMS = (
     ("base",),
     ("report",),
-    ("motions.table",),
+    ("motions.table", "motions.own"),
     ("scenario",),
     ("estimation",),
     ("motions",),

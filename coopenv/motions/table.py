@@ -9,19 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from coopenv.base.errors import CoopenvError, check_one_of, shown
-from coopenv.base.installation import blamed, check_reference, is_reference, load_reference
-
-
-@dataclass(frozen=True)
-class CommandColumn:
-    """One column of a command: what an entry of an action spans as it goes from -1 to 1."""
-
-    name: str  # of what is commanded
-    unit: str  # of low and high
-    low: float  # value of -1
-    high: float  # value of 1
-    limit: str = ""  # key of `[dynamics]` that sets `high`; empty: the class of the user's own drive sets it
+from coopenv.base.errors import check_one_of
+from coopenv.base.installation import check_reference, is_reference
+from coopenv.motions.own import POSE, CommandColumn, OwnDrive
 
 
 @dataclass(frozen=True)
@@ -83,7 +73,7 @@ def columns_of(limits: Any) -> tuple[CommandColumn, ...]:
         CoopenvError: the class of the user's own drive cannot be loaded, fails, or has no such columns.
     """
     if is_reference(limits.model):
-        return own_columns(limits.model, made(limits))
+        return OwnDrive(limits).columns
     found = []
     for name, unit, key in MOTIONS[limits.model].columns:
         high = getattr(limits, key)
@@ -91,24 +81,9 @@ def columns_of(limits: Any) -> tuple[CommandColumn, ...]:
     return tuple(found)
 
 
-def made(limits: Any) -> Any:
-    """Return the user's own drive, made from the vehicle's `[dynamics]`. Raises CoopenvError: its code fails."""
-    kind = load_reference(limits.model)
-    with blamed(f"dynamics.model: {limits.model}"):
-        return kind(limits)
+def further_bodies(limits: Any) -> int:
+    """Return the number of boxes that a user's own drive has besides the vehicle's body. Raises CoopenvError."""
+    import numpy as np
 
-
-def own_columns(model: str, drive: Any) -> tuple[CommandColumn, ...]:
-    """Return the columns of a user's own drive, checked. Raises CoopenvError: they are not name, unit, low and high."""
-    where, given = f"dynamics.model: {model}", getattr(drive, "columns", None)
-    if not isinstance(given, list | tuple) or len(given) < 2:
-        raise CoopenvError(f"{where}: columns: expected two or more (name, unit, low, high), got {shown(given)}")
-    for row in given:
-        try:
-            name, unit, low, high = row
-            valid = name.isidentifier() and isinstance(unit, str) and -1e9 <= float(low) < float(high) <= 1e9
-        except (TypeError, ValueError, AttributeError):
-            valid = False
-        if not valid:
-            raise CoopenvError(f"{where}: columns: expected (name, unit, low, high) with low < high, got {shown(row)}")
-    return tuple(CommandColumn(name, unit, float(low), float(high)) for name, unit, low, high in given)
+    drive = OwnDrive(limits)
+    return len(drive.bodies(drive.start(np.zeros(len(POSE)))))

@@ -15,7 +15,7 @@ from coopenv.base.errors import ScenarioError, ScenarioWarning, check_one_of, li
 from coopenv.base.installation import load_reference
 from coopenv.base.sections import Positive, Section, Text, Vector3, overlaid, validated
 from coopenv.base.units import EPISODE, PLACE, TIME, warn_of_implausible
-from coopenv.motions.table import DRIVES, columns_of
+from coopenv.motions.table import DRIVES, columns_of, further_bodies
 from coopenv.report.notebook import facts_html, one_line, picture_html
 from coopenv.scenario.bodies import MOST_LANDMARKS, Landmark, LandmarkGroup, Obstacle, Road, Vehicle
 from coopenv.scenario.cosimulators import COSIMULATORS, Cosimulator, Highway, Program, Sumo
@@ -250,6 +250,19 @@ class Scenario(Section, metaclass=_Loaded):
         return None if self.backend == "simulated" else getattr(self, self.backend)
 
     @property
+    def own_drives(self) -> dict[int, Dynamics]:
+        """The dynamics of the vehicles that a drive of the user's own moves, by their indices."""
+        pairs = enumerate(zip(self.vehicles, self.limits, strict=True))
+        return {i: own for i, (vehicle, own) in pairs if vehicle.motion.kind == "driven" and own.model not in DRIVES}
+
+    @property
+    def most_boxes(self) -> int:
+        """Largest number of moving boxes besides agents: a co-simulator's traffic, or further bodies of own drives."""
+        if self.cosimulator is not None:
+            return self.cosimulator.most_vehicles
+        return sum(further_bodies(limits) for limits in self.own_drives.values())
+
+    @property
     def ticks_per_decision(self) -> int:
         """Camera ticks between two decisions of the policy."""
         return round(self.rates.camera / self.rates.decision)
@@ -424,12 +437,8 @@ def _problems_of_drive(s: Scenario, vehicle: Vehicle, limits: Dynamics) -> Itera
     """Yield the conflicts of a vehicle's kind of motion with the simulator that moves it."""
     if vehicle.motion.kind == "traffic" and s.cosimulator is None and limits.model != DRIVES[0]:
         yield f"model: {shown(limits.model)}: the model of traffic drives vehicles of the model '{DRIVES[0]}'"
-    if limits.model in DRIVES:
-        return
-    if s.cosimulator is not None or s.sensing == "images":
+    if limits.model not in DRIVES and (s.cosimulator is not None or s.sensing == "images"):
         yield f"model: {shown(limits.model)}: the user's own drive needs backend = 'simulated' without rendered frames"
-    for key in [key for key in ("latency", "dead_band", "gated") if getattr(limits, key)]:
-        yield f"{key}: not of the user's own drive, whose class has its own actuators; leave this out"
 
 
 def _receives(s: Scenario) -> bool:

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, ConfigDict, Field, create_model, model_vali
 from coopenv.base import units
 from coopenv.base.errors import listed, suggest
 from coopenv.base.sections import NonNegative, Number, Positive, Section
-from coopenv.motions.table import CommandColumn
+from coopenv.motions.own import CommandColumn
 from coopenv.scenario.terms import (
     GROUPS,
     OBSERVATION_FIELDS,

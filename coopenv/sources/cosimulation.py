@@ -36,7 +36,7 @@ class Poses:
     traffic_position: Array  # (Z, 3) centres of boxes, m
     traffic_heading: Array  # (Z,) rad
     traffic_half: Array  # (Z, 3) half of their edges, m
-    driven: Array | bool = False  # (N,) bool, moved by commands and `[dynamics]`: poses count at the start only
+    driven: Array | bool = False  # (N,) moved by commands and `[dynamics]`: poses count at the start only
 
 
 AXES: Mapping[str, tuple[int, ...]] = {field.name: () for field in dataclass_fields(Poses)} | {

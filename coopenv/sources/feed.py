@@ -277,6 +277,10 @@ RECORDED = Source("recorded", rewind, sense_nothing, resense, sense_nothing, rec
 """Ticks of a recording, or of any other source that is not on the device."""
 
 
+PLACED = wp.constant(2)
+"""Value of `driven` of a vehicle that starts where the simulation draws it."""
+
+
 @cache
 def cosimulation_struct(p: Precision) -> Any:
     """Return the Warp struct of the poses and twists of the present tick, in one precision."""
@@ -294,7 +298,7 @@ def cosimulation_struct(p: Precision) -> Any:
         steering: array("WN", scalar)
         crashed: array("WN", wp.int32)
         left: array("WN", wp.int32)
-        driven: array("WN", wp.int32)  # moved here, by commands; its row of the others is not read
+        driven: array("WN", wp.int32)  # moved here, by commands, and its other entries are not read; or `PLACED`
 
     return HostMotion
 
@@ -332,7 +336,8 @@ def begin_cosimulation(model: Any, state: Any, motion: Any, world: int):
     """Begin an episode where the vehicles stand; initial estimates are drawn as in the simulation."""
     place_bodies(model, state, world)
     for vehicle in range(model.vehicles):
-        take_pose(model, state, motion, world, vehicle)
+        if motion.driven[world, vehicle] != PLACED:
+            take_pose(model, state, motion, world, vehicle)
         agent = model.landmarks + vehicle
         state.start_rotation[world, agent] = state.rotation[world, agent]
         state.start_position[world, agent] = state.position[world, agent]

@@ -119,6 +119,10 @@ def simulation_of(scenario: Scenario) -> Simulated:
     if scenario.sensing in offered(GROUP):
         made: Simulated = call(kinds(scenario.sensing)[scenario.sensing].simulation, scenario)
         return made
+    if scenario.own_drives:
+        from coopenv.sources.own_drives import OwnDriven
+
+        return OwnDriven(scenario)
     from coopenv.sources.worlds import Simulated
 
     return Simulated(scenario)

@@ -250,7 +250,7 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "vehicles": vehicles,
         "agents": agents,
         "obstacles": len(scenario.obstacles),
-        "traffic": scenario.cosimulator.most_vehicles if scenario.cosimulator else 0,
+        "traffic": scenario.most_boxes,
         "sensed": scenario.topology.mode == "sensed",
         "sensing": {"ideal": IDEAL, "blind": BLIND}.get(scenario.sensing, SENSED),
         "camera_rate": rates.camera,
@@ -381,8 +381,7 @@ def _cells(scenario: Scenario) -> dict[str, Any]:
     origin, obstacles = np.array(scenario.map.origin), scenario.obstacles
     everyone: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
     reaches = [math.hypot(*agent.body.center) + math.hypot(*agent.body.size) / 2 for agent in everyone if agent.body]
-    traffic = scenario.cosimulator.most_vehicles if scenario.cosimulator else 0
-    items = max(len(everyone) + traffic, len(obstacles))
+    items = max(len(everyone) + scenario.most_boxes, len(obstacles))
     across = 1 if items <= MOST_IN_ONE_CELL else 1 << math.ceil(math.log2(items) / 2)
     ranges = [camera.range for camera in scenario.cameras if camera.range is not None]
     edge = min(ranges, default=LONGEST_CELL) / CELLS_PER_RANGE
