@@ -250,19 +250,6 @@ class Scenario(Section, metaclass=_Loaded):
         return None if self.backend == "simulated" else getattr(self, self.backend)
 
     @property
-    def own_drives(self) -> dict[int, Dynamics]:
-        """The dynamics of the vehicles that a drive of the user's own moves, by their indices."""
-        pairs = enumerate(zip(self.vehicles, self.limits, strict=True))
-        return {i: own for i, (vehicle, own) in pairs if vehicle.motion.kind == "driven" and own.model not in DRIVES}
-
-    @property
-    def most_boxes(self) -> int:
-        """Largest number of moving boxes besides agents: a co-simulator's traffic, or further bodies of own drives."""
-        if self.cosimulator is not None:
-            return self.cosimulator.most_vehicles
-        return sum(further_bodies(limits) for limits in self.own_drives.values())
-
-    @property
     def ticks_per_decision(self) -> int:
         """Camera ticks between two decisions of the policy."""
         return round(self.rates.camera / self.rates.decision)
@@ -507,6 +494,19 @@ def _doubts(s: Scenario, neighbours: Sequence[Sequence[int]]) -> Iterator[str]:
                 "the scene"
             )
             break
+
+
+def own_drives(scenario: Scenario) -> dict[int, Dynamics]:
+    """Return the dynamics of the vehicles that a drive of the user's own moves, by their indices."""
+    pairs = enumerate(zip(scenario.vehicles, scenario.limits, strict=True))
+    return {i: own for i, (vehicle, own) in pairs if vehicle.motion.kind == "driven" and own.model not in DRIVES}
+
+
+def most_boxes(scenario: Scenario) -> int:
+    """Return the largest number of moving boxes besides agents: a co-simulator's traffic, or bodies of own drives."""
+    if scenario.cosimulator is not None:
+        return scenario.cosimulator.most_vehicles
+    return sum(further_bodies(limits) for limits in own_drives(scenario).values())
 
 
 def agent_starts(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:

@@ -121,8 +121,7 @@ FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
         ("turn_rate", "vehicle", 1, "rad/s", "turn_rate", -1,
          "turn rate of a drive without steering, positive to the left"),
         ("lateral_speed", "vehicle", 1, "m/s", "lateral_speed", -1, "speed of an omnidirectional drive to the left"),
-        ("last_action", "vehicle", 3, "1", 1, -1,
-         "first entries of the last decision's action, at most three: those that drive, and the camera's"),
+        ("last_action", "vehicle", 3, "1", 1, -1, "action of the last decision, its first three entries at most"),
         ("time_left", "vehicle", 1, "horizon", 0.5, -1, "share of the horizon that is left", None, 0.5),
     ],
     "pan": [

@@ -15,6 +15,7 @@ from coopenv.estimation.poses import Array
 from coopenv.motions.command import LATERAL, SPEED, TURN
 from coopenv.motions.own import POSE, OwnDrive
 from coopenv.scenario import Scenario
+from coopenv.scenario.schema import most_boxes, own_drives
 from coopenv.sources.cosimulation import CosimulatedWorld, Moment, Poses, TrafficProgram
 from coopenv.sources.feed import PLACED
 from coopenv.sources.worlds import Simulated
@@ -33,8 +34,8 @@ class OwnDrives(TrafficProgram):
 
     def __init__(self, scenario: Scenario) -> None:
         """Make the drives. Raises CoopenvError: a class cannot be loaded or fails."""
-        self._drives = {i: OwnDrive(limits) for i, limits in scenario.own_drives.items()}
-        self._period, self._boxes = 1.0 / scenario.rates.camera, scenario.most_boxes
+        self._drives = {i: OwnDrive(limits) for i, limits in own_drives(scenario).items()}
+        self._period, self._boxes = 1.0 / scenario.rates.camera, most_boxes(scenario)
         self._ground = -scenario.map.origin[2]
         self._states: dict[int, Array] = {}
         self._poses = self._placed(len(scenario.vehicles))

@@ -119,7 +119,9 @@ def simulation_of(scenario: Scenario) -> Simulated:
     if scenario.sensing in offered(GROUP):
         made: Simulated = call(kinds(scenario.sensing)[scenario.sensing].simulation, scenario)
         return made
-    if scenario.own_drives:
+    from coopenv.scenario.schema import own_drives
+
+    if own_drives(scenario):
         from coopenv.sources.own_drives import OwnDriven
 
         return OwnDriven(scenario)

@@ -17,7 +17,7 @@ from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.difficulty import FASTEST_PACE, PARAMETERS
 from coopenv.scenario.dynamics import Dynamics
 from coopenv.scenario.routes import Signal, compile_motion, even_points, followers, point_count
-from coopenv.scenario.schema import agent_starts, neighbour_sets, processing_order
+from coopenv.scenario.schema import agent_starts, most_boxes, neighbour_sets, processing_order
 from coopenv.scenario.sensing import Camera, Faults, Noise, Rates, rotation_of
 from coopenv.world.model import BLIND, DRIVEN, IDEAL, PRESCRIBED, SENSED, STATIC, Precision, entry_struct, model_struct
 from coopenv.world.warp_internals import field_types, scalar_of
@@ -250,7 +250,7 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "vehicles": vehicles,
         "agents": agents,
         "obstacles": len(scenario.obstacles),
-        "traffic": scenario.most_boxes,
+        "traffic": most_boxes(scenario),
         "sensed": scenario.topology.mode == "sensed",
         "sensing": {"ideal": IDEAL, "blind": BLIND}.get(scenario.sensing, SENSED),
         "camera_rate": rates.camera,
@@ -381,7 +381,7 @@ def _cells(scenario: Scenario) -> dict[str, Any]:
     origin, obstacles = np.array(scenario.map.origin), scenario.obstacles
     everyone: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
     reaches = [math.hypot(*agent.body.center) + math.hypot(*agent.body.size) / 2 for agent in everyone if agent.body]
-    items = max(len(everyone) + scenario.most_boxes, len(obstacles))
+    items = max(len(everyone) + most_boxes(scenario), len(obstacles))
     across = 1 if items <= MOST_IN_ONE_CELL else 1 << math.ceil(math.log2(items) / 2)
     ranges = [camera.range for camera in scenario.cameras if camera.range is not None]
     edge = min(ranges, default=LONGEST_CELL) / CELLS_PER_RANGE

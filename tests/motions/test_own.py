@@ -1,4 +1,4 @@
-"""The trailer of docs/contributing/vehicle.md, a drive of the user's own: truth, odometry, records, pictures, errors."""
+"""The trailer of docs/contributing/vehicle.md, a user's own drive: truth, odometry, records, pictures, errors."""
 
 from __future__ import annotations
 
