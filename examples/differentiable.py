@@ -22,6 +22,7 @@ from coopenv.base.seeds import world_keys
 from coopenv.estimation.linalg import block3, cholesky6, exp_so3, increment, join6, orthonormalise
 from coopenv.motions.command import command_of
 from coopenv.motions.dispatch import displacement, drive_step
+from coopenv.motions.table import DRIVES
 from coopenv.observers.riccati import accumulate_information, correct_kalman, predict_covariance, predict_pose
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets, processing_order
@@ -75,8 +76,10 @@ def command_kernel(model: Any, action: wp.array3d(dtype=Any), command: wp.array2
     lateral = scalar(0.0)
     if model.columns > 2:
         lateral = action[world, vehicle, 2]
-    levels = action[world, vehicle, 0], action[world, vehicle, 1]
-    command[world, vehicle] = command_of(model.dynamics[vehicle], levels[0], levels[1], lateral, scalar(0.0))
+    first = action[world, vehicle, 0]
+    command[world, vehicle] = command_of(
+        model.dynamics[vehicle], first, action[world, vehicle, 1], lateral, scalar(0.0)
+    )
 
 
 def drive_kernel(
@@ -377,6 +380,7 @@ def check_differentiable(scenario: Scenario) -> None:
     v2x, cameras, observer = scenario.v2x, scenario.cameras, scenario.observer
     reasons = {
         "every vehicle must have the motion 'driven'": all(v.motion.kind == "driven" for v in scenario.vehicles),
+        "dynamics.model must be a kind of coopenv's": all(limits.model in DRIVES for limits in scenario.limits),
         "noise.enabled must be false": not any(noise.enabled for noise in scenario.noises),
         "v2x must have delay 0, period 1, no loss, range or staleness": (
             (v2x.delay, v2x.period, v2x.loss, v2x.range, v2x.staleness) == (0, 1, 0.0, None, None)

@@ -27,9 +27,10 @@ def _chosen(names: Sequence[str]) -> Any:
     @wp.func
     def displacement_of(d: Any, forward: Any, turn: Any, lateral: Any, dt: Any, like: Any):
         """Return way and turn by the first kind, or by another one."""
+        way, turned = others(d, forward, turn, lateral, dt, like)
         if d.kind == number:
-            return first(d, forward, turn, lateral, dt, like)
-        return others(d, forward, turn, lateral, dt, like)
+            way, turned = first(d, forward, turn, lateral, dt, like)
+        return way, turned
 
     return displacement_of
 
