@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.estimation.poses import Array, exp_so3, lengths, orthonormalise, right_jacobian, skew, solve
-from coopenv.observers import bearing_measurements
-from coopenv.observers.bearing_measurements import Frame
+from coopenv.observers import frame, uncertain_pose
 from coopenv.observers.correction import Stacked
+from coopenv.observers.frame import Frame
 from coopenv.observers.pose_filters import Mekf
 from coopenv.observers.recording import Recording
 from coopenv.observers.runner import Run, run
@@ -25,7 +25,7 @@ OBSERVER = "mekf_covariance"
 def predicted(
     kind: int, R: Array, p: Array, P: Array, rotation: Array, translation: Array, noise: Array
 ) -> tuple[Array, Array, Array]:
-    """Return what `bearing_measurements.predicted` does of a left error."""
+    """Return what `uncertain_pose.predicted` does of a left error."""
     F, E = np.zeros((6, 6)), rotation.T
     F[:3, :3] = F[3:, 3:] = E
     F[3:, :3] = E.dot(skew(-translation))
@@ -45,7 +45,7 @@ def across(u: Array) -> Array:
 def linearise(
     R: Array, p: Array, right: bool, lever_arm: Array, bearings: Array, positions: Array, C: Array, variance: float
 ) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
-    """Return what `bearing_measurements.linearise` does of a left error."""
+    """Return what `frame.linearise` does of a left error."""
     a = (positions - p).dot(R)
     d = a - lever_arm
     distance = np.maximum(lengths(d), 1e-9)[:, None]
@@ -73,7 +73,7 @@ def gain(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array, f
 
 
 def recentring(dx: Array) -> Array:
-    """Return what `bearing_measurements.recentring` does of a left error."""
+    """Return what `uncertain_pose.recentring` does of a left error."""
     G = np.zeros((6, 6))
     G[:3, :3], G[3:, 3:] = right_jacobian(dx[:3]), exp_so3(dx[:3]).T
     return G
@@ -106,8 +106,8 @@ def main() -> None:
     """Print both times and their ratio."""
     recording = record(load_scenario("lane:8", {"horizon": 12.0}))
     compiled, numba = measured(recording)
-    bearing_measurements.predicted, bearing_measurements.linearise = predicted, linearise
-    bearing_measurements.spread = lambda H, P, N: H.dot(P) @ H.transpose(0, 2, 1) + N
+    uncertain_pose.predicted, frame.linearise = predicted, linearise
+    frame.spread = lambda H, P, N: H.dot(P) @ H.transpose(0, 2, 1) + N
     vars(sys.modules[Mekf.__module__])["updated"] = updated
     plain, numpy = measured(recording)
     difference = float(np.abs(plain.position[1:] - compiled.position[1:]).max())

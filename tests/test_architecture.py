@@ -13,10 +13,9 @@ PACKAGE = Path(__file__).resolve().parents[1] / "coopenv"
 ROOMS = (
     ("base",),
     ("report",),
-    ("motions.table", "motions.own"),
-    ("scenario",),
     ("estimation",),
-    ("motions",),
+    ("measurements", "motions"),
+    ("scenario",),
     ("world",),
     ("observers",),
     ("sources", "backends"),

@@ -12,7 +12,7 @@ import warp as wp
 
 from coopenv.observers.registry import find_embedded
 from coopenv.observers.riccati import DEAD_RECKONING
-from coopenv.observers.runner import start_covariances
+from coopenv.observers.setups import start_covariances
 from coopenv.scenario import load_scenario
 from coopenv.world.dynamics import move
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Source, sense_nothing

@@ -29,9 +29,9 @@ from numba import types
 
 from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, WHOLE, compiled, eliminated, product
 from coopenv.estimation.poses import Array
-from coopenv.observers.bearing_measurements import LEFT, recentring
 from coopenv.observers.contract import Message, Tick
 from coopenv.observers.frame_graph import GraphEstimator
+from coopenv.observers.uncertain_pose import LEFT, recentring
 
 WINDOW = 20  # frames
 STEP_PERIOD = 0.1  # s between passes through the window

@@ -27,6 +27,8 @@ from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from coopenv.estimation.poses import Array, skew
+from coopenv.measurements.kinds import Placed
+from coopenv.measurements.sensor import MAP, Sensor, landmark_place
 from coopenv.observers.recording import Recording
 
 ERRORS = 11
@@ -222,4 +224,44 @@ def information(
             M[:, other, other] += Hj_t @ Hj
             M[:, own, other] += Hi_t @ Hj
             M[:, other, own] += Hj_t @ Hi
+        for sensor in setup.sensors:
+            for target in sensor.targets.tolist():
+                _add_readings(M, recording, joint, at, int(i), sensor, target, w)
     return M
+
+
+def _add_readings(
+    M: Array, recording: Recording, joint: bool, at: Array, i: int, sensor: Sensor, target: int, w: int
+) -> None:
+    """Add the information of what a sensor of vehicle i has measured of one target to M (k, wN, wN)."""
+    truth, L = recording.truth, recording.landmarks.shape[1]
+    values = recording.readings[sensor.name][at, i, max(target, 0)]
+    R, p = truth.rotation[at, i], truth.position[at, i]
+    own = sensor.placed(R, p, recording.velocity[at, i], recording.angular_velocity[at, i])
+    linear = sensor.linearised(R, own, _place_of(recording, at, target), values)
+    weight = np.where(linear.used, 1.0 / linear.noise, 0.0)[..., None]
+    blocks = [(slice(w * i, w * i + 6), linear.by_own)]
+    if joint and target >= L:
+        j = target - L
+        arm, shift = truth.rotation[at, j] @ skew(recording.setups[j].marker), linear.by_target[..., 3:]
+        by_pose = np.concatenate([linear.by_target[..., :3] - shift @ arm, shift @ truth.rotation[at, j]], axis=-1)
+        blocks.append((slice(w * j, w * j + 6), by_pose))
+    for rows, first in blocks:
+        for columns, second in blocks:
+            M[:, rows, columns] += np.swapaxes(first, -1, -2) @ (weight * second)
+
+
+def _place_of(recording: Recording, at: Array, target: int) -> Placed:
+    """Return a target at some ticks, by the truth; the velocity of a vehicle is that of its odometry."""
+    L, truth = recording.landmarks.shape[1], recording.truth
+    if target == MAP:
+        return Placed.at(np.zeros((len(at), 3)))
+    if target < L:
+        rotations = recording.setups[0].landmark_rotation
+        rotation = np.eye(3) if rotations is None else rotations[target]
+        return landmark_place(recording.landmarks[at, target], np.broadcast_to(rotation, (len(at), 3, 3)))
+    j = target - L
+    R, rate = truth.rotation[at, j], recording.angular_velocity[at, j]
+    marker = recording.setups[j].marker
+    velocity = R @ (recording.velocity[at, j] + np.cross(rate, marker))[..., None]
+    return Placed(truth.position[at, j] + R @ marker, R, velocity[..., 0], rate)

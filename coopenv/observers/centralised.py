@@ -29,29 +29,24 @@ navigation, IEEE Transactions on Robotics 30(1), 2014. H is linearised at the be
 correction, and replaced by the nearest H* with H* N = 0: H* = H - H N (N^T N)^-1 N^T.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from coopenv.estimation.poses import Array, exp_so3, orthonormalise, skew
-from coopenv.observers import bearing_measurements
-from coopenv.observers.bearing_measurements import (
-    LEFT,
-    BearingMeasurements,
-    LinearisedBearings,
-    UncertainPose,
-    increment,
+from coopenv.observers import uncertain_pose
+from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick
+from coopenv.observers.correction import InnovationGate, Stacked, gain, joseph
+from coopenv.observers.frame import (
+    LinearMeasurements,
+    UsableMeasurements,
     linearised,
     measured_message,
-    transition,
+    usable_measurements,
 )
-from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import InnovationGate, Stacked, gain, joseph
-
-Masks = dict[int, NDArray[np.bool_]]
-"""Masks of the visible targets, by vehicle that saw any."""
+from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, transition
 
 
 class Centralised:
@@ -67,6 +62,7 @@ class Centralised:
         """Take the setups of all."""
         self.landmarks = setups[0].landmarks
         self.markers = [setup.marker for setup in setups]
+        self.moves = any("velocity" in sensor.kind.needs for setup in setups for sensor in setup.sensors)
 
     def reset(self, initial_poses: Sequence[tuple[Array, Array]], initial_covariances: Sequence[Array]) -> None:
         """Start with independent errors."""
@@ -83,9 +79,8 @@ class Centralised:
     def update(self, ticks: Sequence[Tick]) -> list[Estimate]:
         """Predict every vehicle, then correct by all bearings in one update."""
         self.predict(ticks)
-        seen = {i: tick.valid for i, tick in enumerate(ticks) if tick.due and tick.valid.any()}
-        if seen:
-            self.correct(ticks, seen)
+        if measured := self.measured(ticks):
+            self.correct(ticks, measured)
         self.sent = [measured_message(tick) for tick in ticks]
         return [UncertainPose(LEFT, R, p, self.covariance(i)).estimate() for i, (R, p) in enumerate(self.poses)]
 
@@ -107,50 +102,50 @@ class Centralised:
         """Return F (6N, 6N) of a tick of odometry."""
         return np.asarray(block_diag(*(transition(*increment(tick)) for tick in ticks)))
 
-    def correct(self, ticks: Sequence[Tick], seen: Masks) -> None:
-        """Correct by the bearings of masks (m,) by vehicle that pass the vehicles' gates, in one update."""
+    def measured(self, ticks: Sequence[Tick]) -> dict[int, UsableMeasurements]:
+        """Return the measurements of vehicles that have any, with all targets at their known or estimated poses."""
+        reports = {self.landmarks + j: Received(self.report(j, tick), 0.0) for j, tick in enumerate(ticks)}
+        due = {i: replace(tick, messages=reports) for i, tick in enumerate(ticks) if tick.due}
+        found = {i: usable_measurements(tick, weighed=False) for i, tick in due.items()}
+        return {i: measured for i, measured in found.items() if measured is not None}
+
+    def report(self, j: int, tick: Tick) -> Message:
+        """Return what a vehicle's message would state of its marker."""
+        (R, p), marker = self.poses[j], self.markers[j]
+        velocity = R.dot(tick.velocity + np.cross(tick.angular_velocity, marker)) if self.moves else None
+        return Message(p + R.dot(marker), R, extra={} if velocity is None else {"velocity": velocity})
+
+    def correct(self, ticks: Sequence[Tick], measured: Mapping[int, UsableMeasurements]) -> None:
+        """Correct by the measurements of vehicles that pass the vehicles' gates, in one update."""
         before, P = self.poses, self.P
-        linear = {i: self.linearise(i, ticks[i], mask) for i, mask in seen.items()}
-        kept = {i: self.gates[i].passed(ticks[i].time, of.residual, of.spread(P), of.ahead) for i, of in linear.items()}
+        linear = {i: self.linearise(i, ticks[i], of) for i, of in measured.items()}
+        kept = {i: self.gates[i].passed(ticks[i].time, of, of.spread(P)) for i, of in linear.items()}
         residual, H, N = _stacked([of.only(kept[i]) for i, of in linear.items()])
         if not len(residual):
             return
-        for i, mask in seen.items():
-            seen[i] = mask.copy()
-            seen[i][mask] = kept[i]
         K, dx, _ = gain(P, H, N, residual)
         if self.halfway:
             at = 0.5 * dx
             self.poses = self.moved(before, at)
-            residual, H, N = _stacked([self.linearise(i, ticks[i], mask) for i, mask in seen.items()])
+            again = {i: of.only(kept[i]) for i, of in self.measured(ticks).items()}
+            residual, H, N = _stacked([self.linearise(i, ticks[i], of) for i, of in again.items()])
             H = H.dot(self.recentring(at))
             K, dx, _ = gain(P, H, N, residual + H.dot(at))
         G = self.recentring(dx)
         self.poses, self.P = self.moved(before, dx), G.dot(joseph(P, K, H, N)).dot(G.T)
 
-    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> LinearisedBearings:
-        """Return the bearings of a mask (m,) of vehicle i, linearised by all errors."""
-        targets = tick.targets[mask].tolist()
-        z = np.array([self.place(target, tick) for target in targets], float).reshape(-1, 3)
-        bearings = np.asarray(tick.bearings[mask], float)
-        known = BearingMeasurements(bearings, z, np.zeros((len(z), 3, 3)), np.array(targets), np.full(len(z), None))
-        own = linearised(UncertainPose(LEFT, *self.poses[i], self.P), tick, known)
-        H = np.zeros((len(z), 2, len(self.P)))
+    def linearise(self, i: int, tick: Tick, measured: UsableMeasurements) -> LinearMeasurements:
+        """Return measurements of vehicle i, linearised by all errors."""
+        own = linearised(UncertainPose(LEFT, *self.poses[i], self.P), tick, measured)
+        H = np.zeros((*own.residual.shape, len(self.P)))
         H[:, :, self.block(i)] = own.H
-        for n, target in enumerate(targets):
+        for n, target in enumerate(measured.targets.tolist()):
             if (j := target - self.landmarks) >= 0:
                 G = own.G[n].dot(self.poses[j][0])
                 H[n, :, self.block(j)] = np.concatenate([G.dot(skew(-self.markers[j])), G], axis=1)
+                if own.turn is not None:
+                    H[n, :, self.block(j)][:, :3] += own.turn[n]
         return own._replace(H=H)
-
-    def place(self, target: int, tick: Tick) -> Array:
-        """Return (3,) the known or estimated position of a target, map frame, m."""
-        if target < self.landmarks:
-            landmark: Array = tick.landmarks[target]
-            return landmark
-        R, p = self.poses[target - self.landmarks]
-        marker: Array = p + R.dot(self.markers[target - self.landmarks])
-        return marker
 
     @staticmethod
     def moved(poses: Sequence[tuple[Array, Array]], dx: Array) -> list[tuple[Array, Array]]:
@@ -159,16 +154,17 @@ class Centralised:
 
     @staticmethod
     def recentring(dx: Array) -> Array:
-        """Return (6N, 6N) what `bearing_measurements.recentring` returns, of every pose."""
-        return np.asarray(block_diag(*(bearing_measurements.recentring(LEFT, e) for e in dx.reshape(-1, 6))))
+        """Return (6N, 6N) what `uncertain_pose.recentring` returns, of every pose."""
+        return np.asarray(block_diag(*(uncertain_pose.recentring(LEFT, e) for e in dx.reshape(-1, 6))))
 
     def messages(self) -> list[Message]:
         """Return the raw measurements of this tick: odometry and bearings."""
         return self.sent
 
 
-def _stacked(linear: Sequence[LinearisedBearings]) -> Stacked:
-    return LinearisedBearings(*(np.concatenate(parts) for parts in zip(*linear, strict=True))).stacked()
+def _stacked(linear: Sequence[LinearMeasurements]) -> Stacked:
+    residual, H, N = zip(*(of.stacked() for of in linear), strict=True)
+    return np.concatenate(residual), np.concatenate(H), np.asarray(block_diag(*N))
 
 
 class FirstEstimatesEkf(Centralised):
@@ -210,9 +206,9 @@ class FirstEstimatesEkf(Centralised):
             F[6 * i + 3 : 6 * i + 6, 6 * i : 6 * i + 3] = skew(self.first[i] - p - R.dot(tick.translation))
         return F
 
-    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> LinearisedBearings:
-        """Return the bearings of a mask (m,) of vehicle i, linearised by all errors."""
-        linear = super().linearise(i, tick, mask)
+    def linearise(self, i: int, tick: Tick, measured: UsableMeasurements) -> LinearMeasurements:
+        """Return measurements of vehicle i, linearised by all errors."""
+        linear = super().linearise(i, tick, measured)
         return linear._replace(H=self.turned(linear.H))
 
     @staticmethod
@@ -244,10 +240,10 @@ class ObservabilityConstrainedEkf(FirstEstimatesEkf):
         NT = np.swapaxes(N, -1, -2)
         self.projection = N @ np.linalg.solve(NT @ N, NT)  # (N, N, 12, 12)
 
-    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> LinearisedBearings:
-        """Return the bearings of a mask (m,) of vehicle i, linearised by all errors."""
-        linear = super().linearise(i, tick, mask)
-        targets = tick.targets[mask] - self.landmarks
+    def linearise(self, i: int, tick: Tick, measured: UsableMeasurements) -> LinearMeasurements:
+        """Return measurements of vehicle i, linearised by all errors."""
+        linear = super().linearise(i, tick, measured)
+        targets = measured.targets - self.landmarks
         rows = np.flatnonzero(targets >= 0)
         j = targets[rows]
         of = linear.H.reshape(*linear.H.shape[:2], linear.H.shape[2] // 6, 6)  # a view

@@ -18,6 +18,7 @@ from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.sections import LARGEST
 from coopenv.estimation.poses import Array, Coordinates
 from coopenv.estimation.validity import MAX_BEND, MOST_LOPSIDED, are_rotations
+from coopenv.measurements.sensor import Reading, Sensor
 
 BYTES_PER_NUMBER = 8
 MIN_BEARING_STD = 1e-4  # rad; noise-free scenarios would leave a Kalman filter with a singular innovation
@@ -123,6 +124,9 @@ class Setup:
     calibration, such as recorded robots."""
     optical_axis: tuple[float, float, float] = (1.0, 0.0, 0.0)
     """Unit vector of the camera in the body frame, from which a wrong focal length moves bearings away."""
+    sensors: tuple[Sensor, ...] = ()  # beside the camera
+    landmark_rotation: Array | None = None
+    """(L, 3, 3) of the landmarks on the map, NaN for those that move; None: no sensor measures an orientation."""
 
 
 @dataclass(frozen=True)
@@ -195,6 +199,8 @@ class Tick:
     lever_arm: Array  # (3,) the camera's place in the body, m
     noise: SensorNoise  # standard deviations, those of the setup at the velocity of this tick
     due: bool = True  # whether the scenario's observer rate (`rates.observer`) asks for a correction at this frame
+    readings: tuple[Reading, ...] = ()  # of the sensors beside the camera, in the order of `Setup.sensors`
+    landmark_rotation: Array | None = None  # as in `Setup`
 
     def usable(self) -> list[tuple[int, Array, Array, Message | None]]:
         """Return (target, bearing, position, message) of every measured target with a known or received position.

@@ -40,17 +40,19 @@ from coopenv.estimation.compiled import (
     transformed,
 )
 from coopenv.estimation.poses import Array, solve
-from coopenv.observers.bearing_measurements import (
+from coopenv.observers.contract import Tick
+from coopenv.observers.frame import (
     FRAME,
-    RIGHT,
     Frame,
-    corrected,
+    LinearMeasurements,
+    UsableMeasurements,
     dense,
+    frame_of,
     linearise,
-    moved,
+    linearised,
     normalised,
-    recentring,
 )
+from coopenv.observers.uncertain_pose import RIGHT, UncertainPose, corrected, moved, recentring
 
 CLOSE = 1e-3  # rad: largest turn of a line of sight by the last step
 MOST = 8  # steps, and halvings of a step
@@ -86,6 +88,39 @@ def joseph(P: Array, K: Array, H: Array, N: Array) -> Array:
     after: Array = A.dot(np.ascontiguousarray(P)).dot(A.T) + K.dot(np.ascontiguousarray(N)).dot(K.T)
     after = (after + after.T) / 2
     return after
+
+
+def halfway(P: Array, look: Look, own: int = 6) -> tuple[Array, Array, Array, Array, float]:
+    """Return (K, H, N, dx, r^T S^-1 r at the prediction) of a correction that is linearised half way.
+
+    `halfway_gain` does the same for bearings. Errors after the `own` first stay as they are.
+    """
+    at = np.zeros(len(P))
+    residual, H, N = look(at)
+    _, dx, nis = gain(P, H, N, residual)
+    at[:own] = 0.5 * dx[:own]
+    residual, H, N = look(at)
+    K, dx, _ = gain(P, H, N, residual + H.dot(at))
+    return K, H, N, dx, nis
+
+
+def look_from(state: UncertainPose, tick: Tick, measured: UsableMeasurements) -> Look:
+    """Return measurements as a function of the own error about a predicted pose."""
+
+    def look(at: Array) -> Stacked:
+        residual, H, N = linearised(state.moved(at, state.P), tick, measured).stacked()
+        return residual, H.dot(recentring(state.kind, at)), N
+
+    return look
+
+
+def corrected_pose(state: UncertainPose, tick: Tick, measured: UsableMeasurements) -> tuple[UncertainPose, float]:
+    """Return a predicted pose corrected by measurements, and r^T S^-1 r at the prediction."""
+    if measured.others is None:
+        *pose, nis = updated(*state, frame_of(tick, measured))
+        return UncertainPose(state.kind, *pose), float(nis)
+    K, H, N, dx, nis = halfway(state.P, look_from(state, tick, measured))
+    return state.corrected(dx, joseph(state.P, K, H, N)), nis
 
 
 def turn_of_sight(dx: Array, distance: float) -> float:
@@ -126,6 +161,8 @@ def iterated(P: Array, look: Look, bend: Callable[[Array], float]) -> tuple[Arra
 
 
 LARGEST = 13.8155  # 0.999 of a chi-square of 2: -2 log 0.001
+LARGEST_OF = np.array([LARGEST, 10.828, LARGEST, 16.266, 18.467, 20.515, 22.458])
+"""The same of as many degrees of freedom; a measurement without any row fits."""
 WIDE = 0.5  # rad^2, trace of S: about 30 degrees per axis. Chosen
 AVERAGING = 1.0  # s, over which the share of rejected bearings is averaged. Chosen
 OPENING_SHARE, CLOSING_SHARE = 0.6, 0.1
@@ -141,16 +178,17 @@ class InnovationGate:
         self.is_open = False
         self.time = 0.0  # s, of the last frame
 
-    def passed(self, time: float, residual: Array, S: Array, in_front: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return (m,) which bearings of a frame are accepted.
+    def passed(self, time: float, linear: LinearMeasurements, S: Array) -> NDArray[np.bool_]:
+        """Return (m,) which measurements of a frame are accepted.
 
         Args:
             time: s.
-            residual: (m, 2) rad, in the tangent planes.
-            S: (m, 2, 2) rad^2, their covariances; a bearing with an invalid covariance is never accepted.
-            in_front: (m,) whether the targets are ahead along the bearings.
+            linear: the measurements.
+            S: (m, r, r) covariances of their residuals; a measurement with an invalid one is never accepted.
         """
-        definite, fits, rejected, widest = judged(residual, S, in_front)
+        bearings_alone = linear.used is None
+        made = judged(linear.residual, S, linear.ahead) if bearings_alone else judged_of_all(linear, S)
+        definite, fits, rejected, widest = made
         self.share += (rejected - self.share) * min(1.0, max(0.0, time - self.time) / AVERAGING)
         if widest > WIDE:
             self.share = 1.0
@@ -160,11 +198,13 @@ class InnovationGate:
         return taken
 
 
+Judged = tuple[NDArray[np.bool_], NDArray[np.bool_], float, float]
+"""(m,) which S are covariances, (m,) which measurements fit, the share of the others, and the largest trace, rad^2."""
+
+
 @compiled(MATRIX, MATRICES, types.Array(types.boolean, 1, "A", readonly=True))
-def judged(
-    residual: Array, S: Array, in_front: NDArray[np.bool_]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], float, float]:
-    """Return (m,) which S are covariances, (m,) which bearings fit, the share of the others, and the largest trace."""
+def judged(residual: Array, S: Array, in_front: NDArray[np.bool_]) -> Judged:
+    """Return how bearings with residuals (m, 2) and their covariances (m, 2, 2) are judged."""
     squared = normalised(residual, S)
     definite = squared >= 0.0
     fits = definite & (squared <= LARGEST) & in_front
@@ -172,26 +212,37 @@ def judged(
     return definite, fits, 1.0 - np.count_nonzero(fits) / len(fits), widest
 
 
+def judged_of_all(linear: LinearMeasurements, S: Array) -> Judged:
+    """Return the same of the measurements of any sensors; only angles are wide."""
+    assert linear.used is not None and linear.angles is not None
+    squared = np.einsum("mr,mr->m", linear.residual, np.linalg.solve(S, linear.residual[..., None])[..., 0])
+    definite = (squared >= 0.0) & linear.used.any(axis=1)
+    fits = definite & (squared <= LARGEST_OF[linear.used.sum(axis=1)]) & linear.ahead
+    variances = np.where(linear.angles & linear.used, np.diagonal(S, axis1=1, axis2=2), 0.0)
+    return definite, fits, 1.0 - float(fits.mean()), float(variances.sum(axis=1).max())
+
+
 PLACES = types.Array(types.int64, 1, "A", readonly=True)
 
 
 @compiled(MATRICES, MATRICES, MATRIX, MATRICES, PLACES)
 def joint_jacobian(H: Array, G: Array, recentring: Array, turns: Array, places: Any) -> Array:
-    """Return (2m, 6 + 6k) the derivative of m bearings by the own error and those of k neighbours.
+    """Return (rm, 6 + 6k) the derivative of m measurements by the own error and those of k neighbours' places.
 
     Args:
-        H: (m, 2, 6) by the error about where it is linearised.
-        G: (m, 2, 3) by the points, map axes.
+        H: (m, r, 6) by the error about where it is linearised.
+        G: (m, r, 3) by the points, map axes.
         recentring: (6, 6) of the own error.
         turns: (k, 3, 3) the neighbours' orientations.
         places: (m,) the neighbour of each bearing, -1: none.
     """
-    whole = np.zeros((2 * len(H), 6 + 6 * len(turns)))
+    r = H.shape[1]
+    whole = np.zeros((r * len(H), 6 + 6 * len(turns)))
     for n in range(len(H)):
-        place(whole, 2 * n, 0, product(H[n], recentring))
+        place(whole, r * n, 0, product(H[n], recentring))
         k = places[n]
         if k >= 0:
-            place(whole, 2 * n, 6 * k + 9, product(G[n], turns[k]))
+            place(whole, r * n, 6 * k + 9, product(G[n], turns[k]))
     return whole
 
 

@@ -29,20 +29,11 @@ import numpy as np
 
 from coopenv.estimation.compiled import MATRIX, NUMBER, VECTOR, WHOLE, compiled, congruent
 from coopenv.estimation.poses import Array
-from coopenv.observers.bearing_measurements import (
-    FRAME,
-    RIGHT,
-    BearingMeasurements,
-    Frame,
-    UncertainPose,
-    corrected,
-    frame_of,
-    linearised,
-    recentring,
-)
 from coopenv.observers.contract import Tick
-from coopenv.observers.correction import joseph, own_gain, updated
+from coopenv.observers.correction import corrected_pose, halfway, joseph, look_from, own_gain
+from coopenv.observers.frame import FRAME, Frame, UsableMeasurements, frame_of, linearised
 from coopenv.observers.pose_filters import Mekf
+from coopenv.observers.uncertain_pose import RIGHT, UncertainPose, corrected, recentring
 
 LOWEST, HIGHEST = 0.02, 1.0 - 1e-6  # limits of w; 1 leaves the measurement out
 CLOSE = 1e-9  # to which w is found
@@ -106,19 +97,21 @@ class CovarianceIntersection(Mekf):
 
     sends_covariance = True
 
-    def correct(self, tick: Tick, measured: BearingMeasurements) -> None:
+    def correct(self, tick: Tick, measured: UsableMeasurements) -> None:
         """Correct by the landmarks, then by neighbours one at a time."""
         known = np.array([m is None or m.covariance is None for m in measured.messages])
         self.correct_in_turn(tick, measured, known)
 
-    def fuse_neighbour(self, tick: Tick, one: BearingMeasurements) -> None:
+    def fuse_neighbour(self, tick: Tick, one: UsableMeasurements) -> None:
         """Fuse one bearing to a neighbour with the covariance of its position."""
         state, linear = self.state, linearised(self.state, tick, one)
-        w = weight(state.P, linear.H[0], linear.N[0], tick.noise.bearing_std**2)
+        own = linear.N[0] if one.others is None else linearised(state, tick, one.exact()).N[0]
+        if one.others is None:
+            w = weight(state.P, linear.H[0], linear.N[0], tick.noise.bearing_std**2)
+        else:
+            w = best_split_weight(state.P, np.zeros((6, 6)), linear.H[0], linear.N[0], own)
         if w < 1.0:
-            inflated = one._replace(covariances=one.covariances / (1.0 - w))
-            *pose, _ = updated(*state[:3], state.P / w, frame_of(tick, inflated))
-            self.state = UncertainPose(self.kind, *pose)
+            self.state, _ = corrected_pose(state._replace(P=state.P / w), tick, one.inflated(1.0 / (1.0 - w)))
 
 
 class DistributedInvariant(CovarianceIntersection):
@@ -150,19 +143,21 @@ def log_determinant(P: Array) -> float:
     return total
 
 
-@compiled(MATRIX, MATRIX, MATRIX, MATRIX, NUMBER)
-def best_split_weight(P_d: Array, P_i: Array, H: Array, N: Array, variance: float) -> float:
+@compiled(MATRIX, MATRIX, MATRIX, MATRIX, MATRIX)
+def best_split_weight(P_d: Array, P_i: Array, H: Array, N: Array, R_i: Array) -> float:
     """Return the w with the least det P+ = det P_1 det P_2 / det(H P_1 H^T + P_2), 1 if there is no gain.
 
-    N is R_d + R_i, where R_i has a variance.
+    N is R_d + R_i.
     """
-    R_i = variance * np.eye(2)
     R_d = N - R_i
     best, least = 1.0, log_determinant(P_d + P_i)
     for w in WEIGHTS:
         P_1, P_2 = P_d / w + P_i, R_d / (1.0 - w) + R_i
         S = congruent(H, P_1) + P_2
-        cost = log_determinant(P_1) + np.log(_mixed(P_2, P_2) / _mixed(S, S))
+        if len(S) == 2:
+            cost = log_determinant(P_1) + np.log(_mixed(P_2, P_2) / _mixed(S, S))
+        else:
+            cost = log_determinant(P_1) + log_determinant(P_2) - log_determinant(S)
         if cost < least:
             best, least = w, cost
     return best
@@ -195,16 +190,23 @@ class SplitCovarianceIntersection(CovarianceIntersection):
         self.independent = self.state._replace(P=self.independent).predicted(tick).P
         super().predict(tick)
 
-    def fuse_neighbour(self, tick: Tick, one: BearingMeasurements) -> None:
+    def fuse_neighbour(self, tick: Tick, one: UsableMeasurements) -> None:
         """Fuse one bearing to a neighbour with the covariance of its position."""
         P, P_i, linear = self.state.P, self.independent, linearised(self.state, tick, one)
-        w = best_split_weight(P - P_i, P_i, linear.H[0], linear.N[0], tick.noise.bearing_std**2)
+        own = linearised(self.state, tick, one.exact()).N[0]
+        w = best_split_weight(P - P_i, P_i, linear.H[0], linear.N[0], own)
         if w < 1.0:
             self.state = self.state._replace(P=(P - P_i) / w + P_i)
-            self.fuse(tick, one._replace(covariances=one.covariances / (1.0 - w)))
+            self.fuse(tick, one.inflated(1.0 / (1.0 - w)))
 
-    def fuse(self, tick: Tick, measured: BearingMeasurements) -> float:
+    def fuse(self, tick: Tick, measured: UsableMeasurements) -> float:
         """Correct by bearings; return their normalised innovation squared."""
-        *pose, self.independent, nis = updated_parts(*self.state, self.independent, frame_of(tick, measured))
-        self.state = UncertainPose(self.kind, *pose)
-        return float(nis)
+        if measured.others is None:
+            *pose, self.independent, nis = updated_parts(*self.state, self.independent, frame_of(tick, measured))
+            self.state = UncertainPose(self.kind, *pose)
+            return float(nis)
+        state, own = self.state, linearised(self.state, tick, measured.exact()).noise()
+        K, H, N, dx, nis = halfway(state.P, look_from(state, tick, measured))
+        self.independent = congruent(recentring(state.kind, dx), joseph(self.independent, K, H, own))
+        self.state = state.corrected(dx, joseph(state.P, K, H, N))
+        return nis

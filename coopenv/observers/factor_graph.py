@@ -16,10 +16,11 @@ import numpy as np
 
 from coopenv.estimation.compiled import adjoint
 from coopenv.estimation.poses import Array
-from coopenv.observers.bearing_measurements import LEFT, UncertainPose, linearised, usable_bearings
 from coopenv.observers.contract import Estimate, Setup, Tick
 from coopenv.observers.correction import InnovationGate
+from coopenv.observers.frame import linearised, usable_measurements
 from coopenv.observers.pose_filters import PoseObserver, unit
+from coopenv.observers.uncertain_pose import LEFT, UncertainPose
 
 LAG = 1.0  # s
 KEY_PERIOD = 0.1  # s between key frames
@@ -101,12 +102,12 @@ class FactorGraph(PoseObserver):
 
     def collect(self, tick: Tick) -> None:
         """Add up the residuals of a frame."""
-        measured, R, p = usable_bearings(tick), self.state.R, self.state.p
+        measured, R, p = usable_measurements(tick), self.state.R, self.state.p
         if measured is None:
             return
         linear = linearised(self.state, tick, measured)
         S = linear.spread(self.state.P)
-        measured = measured.only(self.gate.passed(tick.time, linear.residual, S, linear.ahead))
+        measured = measured.only(self.gate.passed(tick.time, linear, S))
         for n, target in enumerate(measured.targets.tolist()):
             position = measured.positions[n]
             seen = self.residuals.setdefault(target, Residuals())

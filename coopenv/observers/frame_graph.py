@@ -2,7 +2,7 @@
 
 Source: Dellaert and Kaess, Factor graphs for robot perception, Foundations and Trends in Robotics 6, 2017. Variables
 are the poses of all vehicles at every camera frame. Factors are the initial estimates, odometry and bearings, as in
-bearing_measurements.py and centralised.py. Every error is a left one: R = Rhat Exp(theta), p = phat + Rhat rho.
+uncertain_pose.py, frame.py and centralised.py. Every error is a left one: R = Rhat Exp(theta), p = phat + Rhat rho.
 
 Frames cannot be combined to fewer: odometry is as precise over one frame as bearings are, so that its noise between two
 variables is not negligible. Where vehicles follow each other in a lane, this decides about the range.
@@ -32,19 +32,10 @@ from coopenv.estimation.compiled import (
     transformed,
 )
 from coopenv.estimation.poses import Array, orthonormalise
-from coopenv.observers.bearing_measurements import (
-    LEFT,
-    BearingMeasurements,
-    UncertainPose,
-    across,
-    increment,
-    linearised,
-    measured_message,
-    moved,
-    put_derivative,
-)
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.correction import LARGEST, PLACES, InnovationGate
+from coopenv.observers.frame import UsableMeasurements, across, linearised, measured_message, put_derivative
+from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, moved
 
 LEAST_STD = 1e-6  # rad and m, of an odometry increment: without noise its information would be infinite
 PHI = LARGEST  # squared residual at which the loss begins to differ from least squares
@@ -186,10 +177,10 @@ class GraphEstimator(ABC):
             of = UncertainPose(LEFT, graph.R[k, j[n]], graph.p[k, j[n]], self.P[j[n]])
             z[n], C[n] = of.p + of.R.dot(graph.markers[j[n]]), of.point_covariance(graph.markers[j[n]])
         bearings = np.asarray(tick.bearings[tick.valid], float)
-        measured = BearingMeasurements(bearings, z, C, targets, np.full(len(targets), None))
+        measured = UsableMeasurements(bearings, z, C, targets, np.full(len(targets), None))
         pose = UncertainPose(LEFT, graph.R[k, vehicle], graph.p[k, vehicle], self.P[vehicle])
         linear = linearised(pose, tick, measured)
-        kept = self.gates[vehicle].passed(tick.time, linear.residual, linear.spread(pose.P), linear.ahead)
+        kept = self.gates[vehicle].passed(tick.time, linear, linear.spread(pose.P))
         graph.add(vehicle, targets[kept], bearings[kept], z[kept])
 
     def broadcast(self, ticks: Sequence[Tick]) -> list[Message]:

@@ -14,28 +14,24 @@ from numpy.typing import NDArray
 
 from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled, exp_so3, exp_translation, transformed
 from coopenv.estimation.poses import Array, cholesky, lengths, solve
-from coopenv.observers.bearing_measurements import (
+from coopenv.observers.contract import Estimate, Message, Setup, Tick
+from coopenv.observers.correction import InnovationGate, corrected_pose, iterated, look_from, turn_of_sight
+from coopenv.observers.frame import (
     FRAME,
-    INVARIANT,
-    LEFT,
-    RIGHT,
-    BearingMeasurements,
     Frame,
-    LinearisedBearings,
-    UncertainPose,
+    LinearMeasurements,
+    UsableMeasurements,
     across,
     dense,
     frame_of,
     linearised,
     normalised,
-    recentring,
-    usable_bearings,
+    usable_measurements,
 )
-from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import InnovationGate, Stacked, iterated, turn_of_sight, updated
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.p3p import solve_p3p
 from coopenv.observers.riccati import RICCATI
+from coopenv.observers.uncertain_pose import INVARIANT, LEFT, RIGHT, UncertainPose
 
 
 class PoseObserver:
@@ -45,16 +41,29 @@ class PoseObserver:
     sends_covariance = True
 
     def __init__(self, setup: Setup) -> None:
-        self.marker = setup.marker  # the point that cameras of other vehicles measure
+        self.marker = setup.marker  # the point that sensors of other vehicles measure
+        self.needed = {name for sensor in setup.sensors for name in sensor.kind.needs}
+        self.twist = np.zeros((2, 3))  # m/s and rad/s, body axes
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
         self.state = UncertainPose.start(self.kind, *initial_pose, initial_covariance)
 
     def message(self) -> Message:
-        """Return the marker's position, and its covariance if this observer sends it."""
+        """Return the marker's position, its covariance if this observer sends it, and what sensors need beside."""
+        position = self.state.p + self.state.R.dot(self.marker)
+        if "rotation" in self.needed:
+            covariance = self.state.marker_covariance(self.marker) if self.sends_covariance else None
+            return Message(position, self.state.R, covariance, self.extra())
         covariance = self.state.point_covariance(self.marker) if self.sends_covariance else None
-        return Message(position=self.state.p + self.state.R.dot(self.marker), covariance=covariance)
+        return Message(position=position, covariance=covariance, extra=self.extra())
+
+    def extra(self) -> dict[str, Array]:
+        """Return the velocity of the marker, map, m/s, if sensors need it."""
+        if "velocity" not in self.needed:
+            return {}
+        velocity, rate = self.twist
+        return {"velocity": self.state.R.dot(velocity + np.cross(rate, self.marker))}
 
 
 class Mekf(PoseObserver):
@@ -76,50 +85,57 @@ class Mekf(PoseObserver):
         self.predict(tick)
         self.nis: float | None = None
         self.nis_dof = 0
-        measured = usable_bearings(tick, self.sends_covariance) if tick.due else None
+        measured = usable_measurements(tick, self.sends_covariance) if tick.due else None
         if measured is not None:
             self.take(tick, measured)
         return self.state.estimate(self.nis, self.nis_dof)
 
     def predict(self, tick: Tick) -> None:
         """Append the increment."""
+        self.twist = np.array([tick.velocity, tick.angular_velocity])
         self.state = self.state.predicted(tick)
 
-    def take(self, tick: Tick, measured: BearingMeasurements) -> None:
+    def take(self, tick: Tick, measured: UsableMeasurements) -> None:
         """Correct by the bearings that pass the gate."""
         if self.gated:
             linear = linearised(self.state, tick, measured)
             S = self.spread(measured, linear)
-            kept = self.gate.passed(tick.time, linear.residual, S, linear.ahead)
+            kept = self.gate.passed(tick.time, linear, S)
             if not kept.all():
                 measured = measured.only(kept)
         if len(measured.targets):
             self.correct(tick, measured)
 
-    def spread(self, measured: BearingMeasurements, linear: LinearisedBearings) -> Array:
-        """Return (m, 2, 2) the covariances of the innovations."""
+    def spread(self, measured: UsableMeasurements, linear: LinearMeasurements) -> Array:
+        """Return (m, r, r) the covariances of the innovations."""
         return linear.spread(self.state.P)
 
-    def correct(self, tick: Tick, measured: BearingMeasurements) -> None:
-        """Correct by bearings."""
-        self.nis, self.nis_dof = self.fuse(tick, measured), 2 * len(measured.targets)
+    def dof(self, tick: Tick, measured: UsableMeasurements) -> int:
+        """Return the number of rows that were measured."""
+        return 2 * len(measured.targets) if measured.others is None else linearised(self.state, tick, measured).dof
 
-    def correct_in_turn(self, tick: Tick, measured: BearingMeasurements, known: NDArray[np.bool_]) -> None:
-        """Correct by the bearings of a mask (m,) at once, then by the others, to neighbours, one at a time."""
+    def correct(self, tick: Tick, measured: UsableMeasurements) -> None:
+        """Correct by measurements."""
+        self.nis_dof = self.dof(tick, measured)
+        self.nis = self.fuse(tick, measured)
+
+    def correct_in_turn(self, tick: Tick, measured: UsableMeasurements, known: NDArray[np.bool_]) -> None:
+        """Correct by the measurements of a mask (m,) at once, then by the others, of neighbours, one at a time."""
         if known.any():
-            self.nis, self.nis_dof = self.fuse(tick, measured.only(known)), 2 * int(known.sum())
+            first = measured.only(known)
+            self.nis_dof = self.dof(tick, first)
+            self.nis = self.fuse(tick, first)
         for n in np.flatnonzero(~known).tolist():
             self.fuse_neighbour(tick, measured.only(slice(n, n + 1)))
 
-    def fuse_neighbour(self, tick: Tick, one: BearingMeasurements) -> None:
+    def fuse_neighbour(self, tick: Tick, one: UsableMeasurements) -> None:
         """Correct by one bearing to a neighbour."""
         self.fuse(tick, one)
 
-    def fuse(self, tick: Tick, measured: BearingMeasurements) -> float:
+    def fuse(self, tick: Tick, measured: UsableMeasurements) -> float:
         """Correct by bearings; return their normalised innovation squared."""
-        *pose, nis = updated(*self.state, frame_of(tick, measured))
-        self.state = UncertainPose(self.kind, *pose)
-        return float(nis)
+        self.state, nis = corrected_pose(self.state, tick, measured)
+        return nis
 
 
 class MekfCovariance(Mekf):
@@ -155,14 +171,10 @@ class RightInvariant(MekfCovariance):
 class IteratedEkf(MekfCovariance):
     """Error-state filter that iterates corrections; sends covariances."""
 
-    def fuse(self, tick: Tick, measured: BearingMeasurements) -> float:
+    def fuse(self, tick: Tick, measured: UsableMeasurements) -> float:
         """Correct by bearings, linearised anew until convergence; return their normalised innovation squared."""
         before, distance = self.state, float(lengths(measured.positions - self.state.p).min())
-
-        def look(at: Array) -> Stacked:
-            residual, H, N = linearised(before.moved(at, before.P), tick, measured).stacked()
-            return residual, H.dot(recentring(before.kind, at)), N
-
+        look = look_from(before, tick, measured)
         dx, P, nis = iterated(before.P, look, lambda dx: turn_of_sight(dx, distance))
         self.state = before.corrected(dx, P)
         return nis
@@ -192,17 +204,20 @@ class Ukf(MekfCovariance):
 
     kind = INVARIANT
 
-    def take(self, tick: Tick, measured: BearingMeasurements) -> None:
-        """Correct by the bearings that pass the gate."""
-        P, frame = self.state.P, frame_of(tick, measured)
-        xi = sigma_points(P)
+    def take(self, tick: Tick, measured: UsableMeasurements) -> None:
+        """Correct by the measurements that pass the gate."""
+        P, xi = self.state.P, sigma_points(self.state.P)
         linear = linearised(self.state, tick, measured)
-        mean, S, y = unscented(self.state.R, self.state.p, xi, linear.N, frame)
+        if measured.others is None:
+            mean, S, y = unscented(self.state.R, self.state.p, xi, linear.N, frame_of(tick, measured))
+        else:
+            mean, S, y = moments(self.deviations(xi, tick, measured, linear), linear)
         r = linear.residual.ravel() - mean
         if self.gated:
-            each = np.arange(len(measured.targets))
-            blocks = S.reshape(len(each), 2, len(each), 2)[each, :, each, :]
-            kept = self.gate.passed(tick.time, r.reshape(-1, 2), blocks, linear.ahead).repeat(2)
+            each, rows = np.arange(len(measured.targets)), linear.residual.shape[1]
+            blocks = S.reshape(len(each), rows, len(each), rows)[each, :, each, :]
+            fits = self.gate.passed(tick.time, linear._replace(residual=r.reshape(-1, rows)), blocks)
+            kept, linear = fits.repeat(rows), linear.only(fits)
             if not kept.any():
                 return
             if not kept.all():
@@ -211,7 +226,19 @@ class Ukf(MekfCovariance):
         gain = solved[:, :-1].T
         P = P - gain.dot(S).dot(gain.T)
         self.state = self.state.moved(gain.dot(r), (P + P.T) / 2)
-        self.nis, self.nis_dof = float(r.dot(solved[:, -1])), len(r)
+        self.nis, self.nis_dof = float(r.dot(solved[:, -1])), linear.dof
+
+    def deviations(self, xi: Array, tick: Tick, measured: UsableMeasurements, linear: LinearMeasurements) -> Array:
+        """Return (k, rm) by how much predictions at sigma points xi (k, 6) exceed the one at the mean."""
+        at = [linearised(self.state.moved(x, self.state.P), tick, measured).residual for x in xi]
+        return np.array([(linear.residual - residual).ravel() for residual in at])
+
+
+def moments(y: Array, linear: LinearMeasurements) -> tuple[Array, Array, Array]:
+    """Return mean (n,) and covariance (n, n) of values (k, n) at the sigma points, and their deviations (k, n)."""
+    mean = WEIGHT * y.sum(axis=0)
+    y = y - mean
+    return mean, linear.noise() + MEAN_WEIGHT * np.outer(mean, mean) + WEIGHT * y.T.dot(y), y
 
 
 def sigma_points(P: Array) -> Array:
@@ -299,12 +326,12 @@ class PerspectivePoints(PoseObserver):
     def update(self, tick: Tick) -> Estimate:
         """Append the increment, and replace the pose by that of the frame where it has one."""
         self.state = self.state.predicted(tick)
-        seen = usable_bearings(tick) if tick.due else None
-        if seen is not None and len(seen.targets) >= 3:
-            self.take(tick, seen)
+        seen = usable_measurements(tick) if tick.due else None
+        if seen is not None and len((bearings := seen.of_camera()).targets) >= 3:
+            self.take(tick, bearings)
         return self.state.estimate()
 
-    def take(self, tick: Tick, data: BearingMeasurements) -> None:
+    def take(self, tick: Tick, data: UsableMeasurements) -> None:
         """Take the pose of a frame if it is accepted."""
         found = refined(self.state, tick, data)
         if found is None or distance(found, self.state) > POSE_GATE:
@@ -316,7 +343,7 @@ class PerspectivePoints(PoseObserver):
         if found is not None and (distance(found, self.state) < POSE_GATE or self.contradicted > PATIENCE):
             self.state, self.contradicted = found, 0.0
 
-    def chosen(self, tick: Tick, data: BearingMeasurements) -> UncertainPose | None:
+    def chosen(self, tick: Tick, data: UsableMeasurements) -> UncertainPose | None:
         """Return the candidate that agrees with most bearings, then the one nearest to the predicted pose."""
         best, most, nearest = None, 3, inf
         triples = np.array([*islice(combinations(range(len(data.bearings)), 3), MOST_TRIPLES)])
@@ -332,18 +359,18 @@ class PerspectivePoints(PoseObserver):
         return best
 
 
-def misfits(pose: UncertainPose, tick: Tick, data: BearingMeasurements, P: Array | None = None) -> Array:
+def misfits(pose: UncertainPose, tick: Tick, data: UsableMeasurements, P: Array | None = None) -> Array:
     """Return (m,) the squared residuals over their variance, infinite for bearings from behind.
 
     With P, the variance is that given a pose with this covariance.
     """
-    residual, H, N, _, ahead = linearised(pose, tick, data)
+    residual, H, N, _, ahead, *_ = linearised(pose, tick, data)
     if P is not None:
         N = N + H @ P @ H.transpose(0, 2, 1)
     return np.where(ahead, normalised(residual, N), inf)
 
 
-def refined(start: UncertainPose, tick: Tick, data: BearingMeasurements) -> UncertainPose | None:
+def refined(start: UncertainPose, tick: Tick, data: UsableMeasurements) -> UncertainPose | None:
     """Return the least-squares pose near a start with its covariance, None where it fails, misfits or is too weak."""
     pose = start
     for _ in range(ITERATIONS):

@@ -4,7 +4,7 @@ import math
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from numbers import Integral, Real
 from operator import attrgetter
 from typing import Any, Self
@@ -12,13 +12,15 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coopenv.base.errors import DataError, DataWarning, shown
+from coopenv.base.errors import CoopenvError, DataError, DataWarning, shown
 from coopenv.base.sections import LARGEST
 from coopenv.estimation.poses import MISFIT_DEG, Array, bearing_misfit_deg, exp_so3, exp_translation
-from coopenv.estimation.validity import Mask, are_numbers, are_unit_vectors, everywhere
+from coopenv.estimation.validity import Mask, are_numbers, are_rotations, are_unit_vectors, everywhere
+from coopenv.measurements.sensor import MAP, Sensor
 from coopenv.observers.arrays import ARRAYS, invalid_rows, misshapen, recorded_names, sizes_of
-from coopenv.observers.contract import Gains, ObserverInit, Received, SensorNoise, Setup, Tick
+from coopenv.observers.contract import Gains, ObserverInit, Received, SensorNoise, Setup, Tick, sealed
 from coopenv.observers.faults import Interference
+from coopenv.observers.readings import problems_of_readings, shapes_of_readings
 from coopenv.observers.sensed import Measurements, Sensed, Truth, is_due
 from coopenv.scenario import Scenario
 from coopenv.scenario.difficulty import MOST, PARAMETERS
@@ -62,6 +64,8 @@ class Recording(Measurements):
                 if values.dtype.kind == "f" and values.dtype != np.float64:
                     object.__setattr__(self, name, values := values.astype(np.float64))
                 values.setflags(write=False)
+        readings = {name: np.asarray(values, np.float64) for name, values in self.readings.items()}
+        object.__setattr__(self, "readings", {name: sealed(values) for name, values in readings.items()})
 
     @classmethod
     def from_arrays(
@@ -79,6 +83,8 @@ class Recording(Measurements):
         truth_position: ArrayLike | None = None,
         truth_rotation: ArrayLike | None = None,
         period: int = 1,
+        sensors: Sequence[Sensor] = (),
+        readings: Mapping[str, ArrayLike] | None = None,
     ) -> Self:
         """Return a recording of vehicle_1, vehicle_2, ... that receive each other's messages one tick later.
 
@@ -96,6 +102,9 @@ class Recording(Measurements):
             truth_position: (K, N, 3) m, map, NaN where not known; None: nowhere.
             truth_rotation: (K, N, 3, 3) body to map, likewise.
             period: ticks between messages.
+            sensors: beside the camera, which every vehicle has; a vehicle among its own targets is left out.
+            readings: (K, N, L + N, size) by the name of a sensor, (K, N, 1, size) of one that measures the map; NaN
+                where nothing was measured.
 
         Raises:
             DataError: an array has another shape or holds what it must not; one line that names it.
@@ -122,7 +131,19 @@ class Recording(Measurements):
         targets, here = np.arange(L + N), np.zeros(3)
         recording = cls(
             setups=tuple(
-                Setup(i, names[L + i], names, L, np.delete(targets, L + i), here, here, noise, gains) for i in range(N)
+                Setup(
+                    i,
+                    names[L + i],
+                    names,
+                    L,
+                    np.delete(targets, L + i),
+                    here,
+                    here,
+                    noise,
+                    gains,
+                    sensors=tuple(replace(s, targets=s.targets[s.targets != L + i]) for s in sensors),
+                )
+                for i in range(N)
             ),
             order=tuple(range(N)),
             dt=dt,
@@ -141,6 +162,7 @@ class Recording(Measurements):
             start_position=arrays["start_position"],
             start_covariance=np.tile(np.diag(np.repeat(np.square(std), 3)), (N, 1, 1)),
             truth=Truth(arrays["truth_rotation"], arrays["truth_position"]),
+            readings={name: _numbers(f"readings.{name}", values) for name, values in (readings or {}).items()},
         )
         check_recording(recording, "recording")
         _warn_of_wrong_truth(recording)
@@ -187,7 +209,8 @@ class Recording(Measurements):
         """Return the measurements of all vehicles at tick k."""
         sensed: dict[str, Any] = {name: values[k] for name, values in self.per_tick().items()}
         truth = Truth(self.truth.rotation[k], self.truth.position[k])
-        return Sensed(index=k, dt=self.dt, due=bool(self.due[k]), truth=truth, **sensed)
+        due, readings = bool(self.due[k]), self.readings_at(k)
+        return Sensed(index=k, dt=self.dt, due=due, truth=truth, readings=readings, **sensed)
 
     def per_tick(self) -> dict[str, Any]:
         """Return by name the arrays that hold what was measured and received at every tick."""
@@ -205,6 +228,7 @@ class Recording(Measurements):
             dt=self.dt,
             odometry_age=self.odometry_age(odometry_rate)[:, None],
             truth=self.truth,
+            readings=self.readings,
             **self.per_tick(),
         )
 
@@ -346,6 +370,29 @@ def _check_setup(setup: Setup, vehicle: int, first: Setup, where: str) -> None:
     for name, count in (("q", len(setup.target_names)), ("V", 2), ("P0", 2)):
         positive = _is_array(getattr(gains, name), (count,)) and np.min(getattr(gains, name)) > 0.0
         _require(positive, f"{where}.gains.{name}: not {count} positive numbers")
+    _check_sensors(setup, first, where)
+
+
+def _check_sensors(setup: Setup, first: Setup, where: str) -> None:
+    """Check the sensors beside the camera of one vehicle."""
+    names, kinds = [sensor.name for sensor in setup.sensors], {s.name: s.reference for s in first.sensors}
+    _require(len(set(names)) == len(names), f"{where}.sensors: two have the same name")
+    for sensor in setup.sensors:
+        place = f"{where}.sensors.{shown(sensor.name)}"
+        _require(NAME.fullmatch(sensor.name), f"{place}: is no name")
+        _require(kinds.get(sensor.name, sensor.reference) == sensor.reference, f"{place}: of several kinds")
+        try:
+            rows, has_target = sensor.kind.rows, sensor.kind.has_target
+        except CoopenvError as error:
+            raise DataError(f"{place}: {error}") from None
+        positive = _is_array(sensor.std, (rows,)) and np.min(sensor.std) > 0.0
+        _require(positive, f"{place}.std: not {rows} positive numbers")
+        targets = set(sensor.targets.tolist())
+        sensible = targets <= set(setup.targets.tolist()) if has_target else targets == {MAP}
+        _require(sensible, f"{place}.targets: not among the targets of {setup.name}, or not the map")
+        _require(_is_array(sensor.position, (3,)), f"{place}.position: not three numbers")
+        turned = _is_array(sensor.rotation, (3, 3)) and bool(are_rotations(sensor.rotation))
+        _require(turned, f"{place}.rotation: not a rotation")
 
 
 def _is_array(values: Any, shape: tuple[int, ...]) -> bool:
@@ -372,6 +419,10 @@ def recorded_arrays(r: Recording) -> dict[str, Any]:
 
 def _check_arrays(r: Recording) -> None:
     values = recorded_arrays(r)
+    for problem in problems_of_readings(r.readings, r.setups, r.ticks):
+        raise DataError(problem)
+    for name in shapes_of_readings(r.setups).keys() - r.readings.keys():
+        raise DataError(f"readings.{name}: missing")
     about = {"now": np.arange(r.ticks)[:, None, None], "period": r.period}
     for name, valid, problem in invalid_rows(values, about, ticks=True):
         _require_all(r, name, valid, problem)
@@ -406,6 +457,10 @@ def _check_scenario(r: Recording) -> None:
     neighbours = neighbour_sets(s)
     for setup, targets in zip(r.setups, neighbours, strict=True):
         _require(setup.targets.tolist() == targets, f"scenario: {setup.name} has other neighbours than in its setup")
+    for setup in r.setups:
+        names = [section.label for section in s.sensors if section.is_on(setup.name)]
+        same = [sensor.name for sensor in setup.sensors] == names
+        _require(same, f"scenario: {setup.name} has other sensors than in its setup")
     for name in recorded_arrays(r).keys() ^ set(recorded_names(s)):
         _require(False, f"{name}: a recording has this array if its scenario asks for it, and only then")
     rates, staleness = s.rates, np.inf if s.v2x.staleness is None else s.v2x.staleness

@@ -24,25 +24,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, adjoint, compiled, eliminated, place, product
+from coopenv.estimation.compiled import MATRICES, MATRIX, NUMBER, VECTOR, adjoint, compiled, eliminated, place, product
 from coopenv.estimation.poses import Array, cholesky
-from coopenv.observers.bearing_measurements import (
-    FRAME,
-    LEFT,
-    BearingMeasurements,
-    Frame,
-    LinearisedBearings,
-    UncertainPose,
-    corrected,
-    frame_of,
-    increment,
-    recentring,
-    transition,
-)
 from coopenv.observers.contract import Message, Setup, Tick
-from coopenv.observers.correction import PLACES, halfway_gain, joseph
+from coopenv.observers.correction import PLACES, Look, Stacked, halfway, halfway_gain, joint_jacobian, joseph
+from coopenv.observers.frame import FRAME, Frame, LinearMeasurements, UsableMeasurements, frame_of, linearised
 from coopenv.observers.pose_filters import Mekf
+from coopenv.observers.uncertain_pose import LEFT, UncertainPose, corrected, increment, recentring, transition
 
 IDENTITY = np.eye(6)
 MOST_LOST = 60  # lost messages in a row that a received factor may stand for
@@ -82,7 +72,7 @@ class ConsiderFilter(Mekf):
         T = self.to_marker
         factor = T.dot(self.factor).dot(self.from_marker)
         self.factor, self.number = IDENTITY, self.number + 1
-        extra = {"factor": factor, "number": np.array([self.number])}
+        extra = {"factor": factor, "number": np.array([self.number]), **self.extra()}
         position = self.state.p + self.state.R.dot(self.marker)
         return Message(position, self.state.R, T.dot(self.state.P).dot(T.T), extra)
 
@@ -98,20 +88,22 @@ class ConsiderFilter(Mekf):
             self.neighbours[j] = ConsideredNeighbour(of.number, of.R, of.P, A.dot(of.cross))
         self.factor = A.dot(self.factor)
 
-    def take(self, tick: Tick, measured: BearingMeasurements) -> None:
+    def take(self, tick: Tick, measured: UsableMeasurements) -> None:
         """Receive the reports of the vehicles in view, then correct."""
         for target, message in zip(measured.targets.tolist(), measured.messages, strict=True):
             if message is not None:
                 self.receive(target, message)
         super().take(tick, measured)
 
-    def spread(self, measured: BearingMeasurements, linear: LinearisedBearings) -> Array:
+    def spread(self, measured: UsableMeasurements, linear: LinearMeasurements) -> Array:
         """Return (m, 2, 2) the covariances of the innovations, cross-covariances included."""
         S = super().spread(measured, linear)
         for n, target in enumerate(measured.targets.tolist()):
             if target in self.neighbours:
                 of = self.neighbours[target]
                 common = linear.H[n].dot(of.cross[:, 3:]).dot(linear.G[n].dot(of.R).T)
+                if linear.turn is not None:
+                    common += linear.H[n].dot(of.cross[:, :3]).dot(linear.turn[n].T)
                 S[n] += common + common.T
         return S
 
@@ -131,24 +123,32 @@ class ConsiderFilter(Mekf):
         cross = bounded(cross, self.state.P, np.asarray(message.covariance, float))
         self.neighbours[target] = ConsideredNeighbour(now, message.rotation, message.covariance, cross)
 
-    def fuse(self, tick: Tick, measured: BearingMeasurements, between: Array | None = None) -> float:
+    def fuse(self, tick: Tick, measured: UsableMeasurements, between: Array | None = None) -> float:
         """Correct by bearings to landmarks and to neighbours that are known; return the squared innovation.
 
-        `between` (n, n, 6, 6) holds the covariances of the neighbours with each other, in the order of the bearings.
+        `between` (n, n, 6, 6) holds the covariances of the neighbours with each other, in the order of `seen`.
         """
-        targets = measured.targets.tolist()
-        seen = [t for t in targets if t in self.neighbours]
+        targets, seen = measured.targets.tolist(), self.seen(measured)
         of, before = [self.neighbours[t] for t in seen], self.state
         joint = self.joint_covariance(of, between)
         places = np.array([seen.index(t) if t in self.neighbours else -1 for t in targets])
         turns = np.array([one.R for one in of], float).reshape(-1, 3, 3)
-        exact = frame_of(tick, measured._replace(covariances=np.zeros((len(targets), 3, 3))))
-        R, p, P, carried, crosses, nis = considered(before.R, before.p, joint, exact, turns, places)
+        exact = measured.exact()
+        if measured.others is None:
+            made = considered(before.R, before.p, joint, frame_of(tick, exact), turns, places)
+        else:
+            look = look_with_neighbours(before, tick, exact, turns, places)
+            made = considered_from(before.R, before.p, joint, *halfway(joint, look))
+        R, p, P, carried, crosses, nis = made
         self.state = UncertainPose(LEFT, R, p, P)
         self.propagate_cross_covariances(carried, [t for t in self.neighbours if t not in seen])
         for target, was, cross in zip(seen, of, crosses, strict=True):
             self.neighbours[target] = ConsideredNeighbour(was.number, was.R, was.P, cross)
         return float(nis)
+
+    def seen(self, measured: UsableMeasurements) -> list[int]:
+        """Return the known neighbours among the targets, each once."""
+        return [target for target in dict.fromkeys(measured.targets.tolist()) if target in self.neighbours]
 
     def joint_covariance(self, of: Sequence[ConsideredNeighbour], between: Array | None) -> Array:
         """Return the joint covariance of the own error and those of neighbours, which is positive definite."""
@@ -171,6 +171,48 @@ class ConsiderFilter(Mekf):
         return shrunk
 
 
+def look_with_neighbours(
+    state: UncertainPose, tick: Tick, measured: UsableMeasurements, turns: Array, places: NDArray[np.int64]
+) -> Look:
+    """Return measurements as a function of the errors (6 + 6k,) of the own pose and of those of k neighbours.
+
+    Args:
+        state: the own pose as predicted.
+        tick: the frame.
+        measured: its measurements, of targets without covariances.
+        turns: (k, 3, 3) the neighbours' orientations.
+        places: (m,) the neighbour of each measurement, -1: none.
+    """
+
+    def look(at: Array) -> Stacked:
+        linear = linearised(state.moved(at[:6], state.P), tick, measured)
+        whole = joint_jacobian(linear.H, linear.G, recentring(LEFT, at[:6]), turns, places)
+        blocks = whole.reshape(*linear.residual.shape, -1)
+        for n, turn in enumerate(() if linear.turn is None else linear.turn):
+            if (k := places[n]) >= 0:
+                blocks[n, :, 6 * k + 6 : 6 * k + 9] += turn
+        return linear.residual.ravel(), whole, linear.noise()
+
+    return look
+
+
+@compiled(MATRIX, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, NUMBER)
+def considered_from(
+    R: Array, p: Array, joint: Array, K: Array, whole: Array, N: Array, dx: Array, nis: float
+) -> tuple[Array, Array, Array, Array, Array, float]:
+    """Return the results of `considered` from a gain K (n, k), derivatives (k, n), noise N (k, k) and dx (n,)."""
+    K = K.copy()
+    K[6:] = 0.0
+    after = joseph(joint, K, whole, N)
+    R, p, P = corrected(LEFT, R, p, dx[:6], after[:6, :6])
+    recentred = recentring(LEFT, dx[:6])
+    carried = eliminated(joint[:6, :6], product(after[:6, :6], recentred.T)).T
+    crosses = np.empty((len(joint) // 6 - 1, 6, 6))
+    for n in range(len(crosses)):
+        place(crosses[n], 0, 0, product(recentred, after[:6, 6 * n + 6 : 6 * n + 12]))
+    return R, p, P, carried, crosses, nis
+
+
 @compiled(MATRIX, VECTOR, MATRIX, FRAME, MATRICES, PLACES)
 def considered(
     R: Array, p: Array, joint: Array, frame: Frame, turns: Array, places: Any
@@ -190,15 +232,7 @@ def considered(
         neighbours (k, 6, 6), and r^T S^-1 r at the prediction.
     """
     K, whole, N, dx, nis = halfway_gain(LEFT, R, p, joint, frame, turns, places)
-    K[6:] = 0.0
-    after = joseph(joint, K, whole, N)
-    R, p, P = corrected(LEFT, R, p, dx[:6], after[:6, :6])
-    recentred = recentring(LEFT, dx[:6])
-    carried = eliminated(joint[:6, :6], product(after[:6, :6], recentred.T)).T
-    crosses = np.empty((len(turns), 6, 6))
-    for n in range(len(turns)):
-        place(crosses[n], 0, 0, product(recentred, after[:6, 6 * n + 6 : 6 * n + 12]))
-    return R, p, P, carried, crosses, nis
+    return considered_from(R, p, joint, K, whole, N, dx, nis)
 
 
 @compiled(MATRIX, MATRIX, MATRIX)
@@ -235,18 +269,16 @@ class SchmidtKalman(ConsiderFilter):
         extra: dict[str, Array] = {**report.extra, "targets": np.array(targets, float), "cross": cross}
         return Message(report.position, report.rotation, report.covariance, extra)
 
-    def correct(self, tick: Tick, measured: BearingMeasurements) -> None:
+    def correct(self, tick: Tick, measured: UsableMeasurements) -> None:
         """Correct by all bearings at once."""
-        seen = [
-            (target, message)
-            for target, message in zip(measured.targets.tolist(), measured.messages, strict=True)
-            if target in self.neighbours and message is not None
-        ]
+        messages = dict(zip(measured.targets.tolist(), measured.messages, strict=True))
+        seen = [(target, messages[target]) for target in self.seen(measured)]
         between = np.zeros((len(seen), len(seen), 6, 6))
         for n, (target, message) in enumerate(seen):
             for m, (other, its) in enumerate(seen[:n]):
                 between[n, m] = sent_cross_covariance(message, other) + sent_cross_covariance(its, target).T
-        self.nis, self.nis_dof = self.fuse(tick, measured, between), 2 * len(measured.targets)
+        self.nis_dof = self.dof(tick, measured)
+        self.nis = self.fuse(tick, measured, between)
 
 
 def sent_cross_covariance(message: Message, target: int) -> Array:
@@ -264,7 +296,7 @@ class Pairwise(ConsiderFilter):
     It sends its pose with covariance and its factor. The normalised innovation is that of the landmarks.
     """
 
-    def correct(self, tick: Tick, measured: BearingMeasurements) -> None:
+    def correct(self, tick: Tick, measured: UsableMeasurements) -> None:
         """Correct by the landmarks, then by neighbours one at a time."""
         known = np.array([target not in self.neighbours for target in measured.targets.tolist()])
         self.correct_in_turn(tick, measured, known)

@@ -13,9 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from coopenv.base.errors import CoopenvError
 from coopenv.base.sections import LARGEST
 from coopenv.estimation.poses import Array
+from coopenv.measurements.sensor import Reading, Sensor
 from coopenv.observers.arrays import ARRAYS, KINDS_OF_TICKS, invalid_rows, misshapen, sizes_of
 from coopenv.observers.contract import ObserverInit, Received, Setup, Tick, sealed
 from coopenv.observers.faults import Interference
+from coopenv.observers.readings import problems_of_readings
 
 
 @dataclass(frozen=True)
@@ -44,10 +46,17 @@ class Measurements:
     visible: NDArray[np.bool_]  # (..., N, T)
     landmarks: Array  # (..., L, 3) map, m
     pan: Array | None = None  # (..., N) rad, by which cameras are turned to the left; None: 0
+    readings: Mapping[str, Array] = field(default_factory=dict)
+    """(..., N, T, size) of each sensor beside the camera, by its name; (..., N, 1, size) of one that measures the map.
+    NaN where nothing was measured."""
 
     def measured(self) -> dict[str, Array]:
         """Return the arrays of this class that are there, by name."""
         return {name: value for name in MEASURED if (value := getattr(self, name)) is not None}
+
+    def readings_at(self, ticks: Any) -> dict[str, Array]:
+        """Return the readings of one or some of several ticks."""
+        return {name: values[ticks] for name, values in self.readings.items()}
 
     def filled(self, name: str) -> NDArray[Any]:
         """Return an array; if it is absent, one of the value that stands for it."""
@@ -104,7 +113,14 @@ class Sensed(Measurements):
             lever_arm=sealed(setup.lever_arm[:]),
             noise=setup.noise.moving(self.velocity[i], self.angular_velocity[i]),
             due=self.due,
+            readings=tuple(self.reading(setup, sensor) for sensor in setup.sensors),
+            landmark_rotation=setup.landmark_rotation,
         )
+
+    def reading(self, setup: Setup, sensor: Sensor) -> Reading:
+        """Return what a sensor of a vehicle has measured."""
+        of_vehicle = self.readings[sensor.name][setup.vehicle]
+        return Reading(sensor, sealed(of_vehicle[np.maximum(sensor.targets, 0)]))
 
 
 def is_due(index: ArrayLike, ratio: float) -> NDArray[np.bool_]:
@@ -113,7 +129,7 @@ def is_due(index: ArrayLike, ratio: float) -> NDArray[np.bool_]:
     return np.asarray(np.floor(k * ratio + 1e-9) > np.floor(np.maximum(k - 1, 0) * ratio + 1e-9))
 
 
-MEASURED = tuple(field.name for field in fields(Measurements))
+MEASURED = tuple(field.name for field in fields(Measurements) if field.name in ARRAYS)
 """Arrays of measurements."""
 REQUIRED = tuple(name for name in MEASURED if ARRAYS[name].optional is None)
 """Arrays of measurements that every tick has."""
@@ -141,6 +157,8 @@ def check_tick(tick: Sensed, index: int, observer_init: ObserverInit) -> None:
     for problem in misshapen(given, sizes_of(observer_init.setups), KINDS_OF_TICKS):
         raise CoopenvError(f"tick {index}: {problem}")
     absent = given.get("missing", np.zeros(len(observer_init.setups), bool))
+    for problem in problems_of_readings(tick.readings, observer_init.setups, ignored=np.asarray(absent)):
+        raise CoopenvError(f"tick {index}: {problem}")
     seen = tick.visible & ~absent[:, None]
     given |= {"visible": seen, "bearings": np.where(seen[..., None], tick.bearings, np.nan)}
     problems = invalid_rows(given, {"now": index, "period": 1}, ticks=False)

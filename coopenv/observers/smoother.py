@@ -23,7 +23,6 @@ from scipy.linalg.lapack import dtbtrs
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.compiled import MATRICES, MATRIX, TARGET, WHOLE, compiled
 from coopenv.estimation.poses import Array
-from coopenv.observers.bearing_measurements import LEFT, recentring
 from coopenv.observers.contract import Tick
 from coopenv.observers.correction import PLACES
 from coopenv.observers.frame_graph import (
@@ -36,6 +35,7 @@ from coopenv.observers.frame_graph import (
     motion,
     pair_information,
 )
+from coopenv.observers.uncertain_pose import LEFT, recentring
 
 LAG = 0.5  # s that are linearised anew
 STEP_PERIOD = 0.1  # s between steps over the lag

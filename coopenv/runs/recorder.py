@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -81,7 +82,7 @@ def record_episode(
         on_tick(engine, k)
         on_progress(k / scenario.horizon_ticks)
     L, observer_init = len(scenario.landmarks), engine.world.observer_init
-    kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in ticks[0].measured()}
+    kept: dict[str, Any] = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in ticks[0].measured()}
     episode = views.episode(scenario, source_of(engine, name, seed, policy if isinstance(policy, str) else "custom"))
     recording = Recording(
         setups=observer_init.setups,
@@ -97,6 +98,7 @@ def record_episode(
         truth=Truth(episode["target_rotation"][:, L:], episode["target_position"][:, L:]),
         scenario=scenario,
         drawn=drawn,
+        readings={name: np.stack([tick.readings[name] for tick in ticks]) for name in ticks[0].readings},
         interference=stacked(faults),
         **kept,
     )

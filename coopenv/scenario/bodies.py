@@ -232,6 +232,8 @@ class Landmark(Section):
     motion: LandmarkMotion = StaticMotion()
     body: Body | None = None
     """A landmark with a body occludes targets behind it."""
+    anchor: bool = False
+    """True for a radio, which cameras do not see."""
     marker: Annotated[Vector3, units.LENGTH] = (0.0, 0.0, 0.0)
     """The point that cameras see, in the landmark's body frame, m."""
 

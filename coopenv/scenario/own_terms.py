@@ -15,6 +15,7 @@ from coopenv.scenario.cosimulators import COSIMULATORS, FILES
 from coopenv.scenario.terms import (
     GROUPS,
     OBSERVATION_FIELDS,
+    READING,
     REWARD_TERMS,
     TERMINATION_CONDITIONS,
     USUAL_GROUPS,
@@ -152,6 +153,11 @@ def located(
         if isinstance(part, dict) and isinstance(part.get("custom"), dict):
             rows = {name: _located(row, folder, place) for name, row in part["custom"].items()}
             result[section] = {**part, "custom": rows}
+    if isinstance(sensors := result.get("sensors"), list):
+        kinds = [_located(entry.get("kind"), folder, place) if isinstance(entry, dict) else None for entry in sensors]
+        result["sensors"] = [
+            {**entry, "kind": kind} if kind else entry for entry, kind in zip(sensors, kinds, strict=True)
+        ]
     for section, keys in FILES.items():
         part = result.get(section)
         if isinstance(part, dict):
@@ -187,6 +193,11 @@ def _located(row: Any, folder: Path, place: Callable[[str, Path], str]) -> Any:
     return place(row, folder) if isinstance(row, str) and installation.is_reference(row) else row
 
 
+def _is_ours(kind: Any, name: str) -> bool:
+    """Return whether a name is that of a term of coopenv, as the fields of sensors are."""
+    return name in kind.built_in or name.startswith(READING)
+
+
 def without_own_terms(raw: Mapping[str, Any]) -> dict[str, Any]:
     """Return a scenario with terms of coopenv only, for recordings, which must name neither code nor folders."""
     result = dict(raw)
@@ -199,10 +210,10 @@ def without_own_terms(raw: Mapping[str, Any]) -> dict[str, Any]:
         part = result[section] = {key: value for key, value in raw[section].items() if key != "custom"}
         for key in ("weights", "scales", "centers"):
             if isinstance(named := part.get(key), dict):
-                part[key] = {name: value for name, value in named.items() if name in kind.built_in}
+                part[key] = {name: value for name, value in named.items() if _is_ours(kind, name)}
         for key in ("include", "exclude"):
             if isinstance(names := part.get(key), list):
-                part[key] = [name for name in names if name in GROUPS or name in kind.built_in]
+                part[key] = [name for name in names if name in GROUPS or _is_ours(kind, name)]
         if part.get("include") == []:
             part["include"] = list(USUAL_GROUPS)
         if section == "termination":

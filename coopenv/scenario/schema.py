@@ -23,6 +23,7 @@ from coopenv.scenario.difficulty import Difficulty, Randomisation
 from coopenv.scenario.dynamics import Dynamics
 from coopenv.scenario.routes import Route, followers, start_of
 from coopenv.scenario.sensing import Camera, Faults, Images, Noise, ObserverSettings, Rates, Topology, V2x
+from coopenv.scenario.sensors import MOST_SENSORS, SensorSection, problems_of_sensors
 from coopenv.scenario.starts import check_room
 from coopenv.scenario.task import Action, Observation, Reward, Termination
 
@@ -89,6 +90,8 @@ class Scenario(Section, metaclass=_Loaded):
     landmark_groups: tuple[LandmarkGroup, ...] = Field(default=(), max_length=1_000)
     vehicles: tuple[Vehicle, ...] = Field(min_length=1, max_length=4_096)
     camera: Camera = Camera()
+    sensors: tuple[SensorSection, ...] = Field(default=(), max_length=MOST_SENSORS)
+    """Sensors beside the camera."""
     rates: Rates = Rates()
     noise: Noise = Noise()
     topology: Topology = Topology()
@@ -337,6 +340,7 @@ def _problems(s: Scenario) -> Iterator[str]:
             for name in [name for name in getattr(vehicle, key) if name not in names]:
                 unknown = f"unknown route {shown(name)}{suggest(name, names)}"
                 yield f"vehicles.{i}.{key}: {unknown}; known: {listed([*names])}"
+    yield from problems_of_sensors(s.sensors, s.vehicle_names, targets, [group.name for group in s.landmark_groups])
     yield from _problems_of_draws(s)
     if s.topology.most_nearby is not None:
         yield from _problems_of_nearby(s)
@@ -357,6 +361,8 @@ def _problems(s: Scenario) -> Iterator[str]:
 def _problems_of_nearby(s: Scenario) -> Iterator[str]:
     """Yield the reasons for which the agents in range of a vehicle are not limited."""
     key, listed = "topology.most_nearby", [vehicle.neighbours for vehicle in s.vehicles]
+    if s.sensors:
+        yield f"{key}: not with [[sensors]], whose measurements keep all targets"
     if s.action.radio or "seen" in s.observation.include:
         yield f"action.radio, observation.include: neither a radio action nor 'seen' with {key}"
     if None not in listed:

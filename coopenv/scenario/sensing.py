@@ -56,10 +56,11 @@ def rotation_of(yaw: float | None, quaternion_wxyz: Any) -> np.ndarray:
 
 def _known_model(given: object) -> object:
     """Refuse another model, in words that help on cars as well, whose pixels mean nothing without a calibration."""
-    if given not in ("pinhole", "omnidirectional"):
+    if given not in ("pinhole", "omnidirectional", "none"):
         raise ValueError(
-            f"expected 'omnidirectional' or 'pinhole', got {shown(given)}; cars need 'pinhole' with the calibration of "
-            "their camera: image_size, focal_length, principal_point and distortion in [camera] of the environment"
+            f"expected 'omnidirectional', 'pinhole' or 'none', got {shown(given)}; cars need 'pinhole' with the "
+            "calibration of their camera: image_size, focal_length, principal_point and distortion in [camera] of the "
+            "environment"
         )
     return given
 
@@ -67,9 +68,10 @@ def _known_model(given: object) -> object:
 class Camera(Section):
     """The camera that every vehicle carries, unless it has its own; optical frame: x right, y down, z forward."""
 
-    model: Annotated[Literal["pinhole", "omnidirectional"], BeforeValidator(_known_model)] = "omnidirectional"
-    """`omnidirectional` sees in every direction; `pinhole` is bounded by its image. The model, range, distortion
-    and quantisation matter only where `topology.mode` is `sensed`; with `fixed` every neighbour is always measured."""
+    model: Annotated[Literal["pinhole", "omnidirectional", "none"], BeforeValidator(_known_model)] = "omnidirectional"
+    """`omnidirectional` sees in every direction; `pinhole` is bounded by its image; `none`: no camera. Model, range,
+    distortion and quantisation matter only where `topology.mode` is `sensed`; with `fixed` every neighbour is always
+    measured."""
     position: Annotated[Vector3, units.LENGTH] = (0.0, 0.0, 0.0)
     """Optical centre in the body frame, m."""
     orientation: Literal["forward", "body"] | QuaternionWxyz = "forward"

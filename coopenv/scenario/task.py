@@ -13,6 +13,7 @@ from coopenv.motions.own import CommandColumn
 from coopenv.scenario.terms import (
     GROUPS,
     OBSERVATION_FIELDS,
+    READING,
     REWARD_TERMS,
     TERMINATION_CONDITIONS,
     USUAL_GROUPS,
@@ -61,7 +62,7 @@ class Observation(Section):
     @model_validator(mode="after")
     def _fields_exist(self) -> Self:
         fields = OBSERVATION_FIELDS.known(self.custom)
-        groups = {*fields, *(row.group for row in fields.values() if row.group)}
+        groups = {*fields, *GROUPS, *(row.group for row in fields.values() if row.group)}
         for key, names, allowed in (
             ("include: unknown group or field", self.include, groups),
             ("exclude: unknown group or field", self.exclude, groups),
@@ -69,7 +70,7 @@ class Observation(Section):
             ("centers: unknown field", self.centers, {*fields}),
         ):
             for name in names:
-                if name not in allowed:
+                if name not in allowed and not name.startswith(READING):
                     near = suggest(name, allowed) or f"; known: {listed(sorted(allowed))}"
                     raise ValueError(f"{key} '{name}'{near}")
         return self

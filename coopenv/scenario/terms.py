@@ -308,7 +308,9 @@ def check_privilege(kind: Registry[Term], used: Mapping[str, float], part: Any) 
             raise ValueError(f"privileged: must be true, because the {kind.kind} '{name}' uses the truth")
 
 
-GROUPS = tuple(FIELDS)
+READINGS, READING = "readings", "reading_"
+"""Group of the fields about sensors beside the camera, and the begin of their names; the sensor's name follows."""
+GROUPS = (*FIELDS, READINGS)
 """Groups of fields of coopenv, in their order in an observation."""
 USUAL_GROUPS = ("estimate", "quality", "bearings", "odometry", "messages", "goal")
 """Groups of a scenario that names none."""

@@ -19,8 +19,8 @@ from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import are_numbers, are_rotations
 from coopenv.motions.command import ACCELERATION, LATERAL, PAN, SPEED, TURN
 from coopenv.observers.contract import Message, ObserverInit, check_message
-from coopenv.observers.runner import observer_init_of
 from coopenv.observers.sensed import Sensed
+from coopenv.observers.setups import observer_init_of
 from coopenv.scenario import Scenario
 from coopenv.world.world import World
 

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.observers.recording import Recording
 from coopenv.observers.sensed import MEASURED, Sensed, Truth
+from coopenv.scenario import Scenario
 from coopenv.scenario.difficulty import PARAMETERS
 from coopenv.world.camera import MISSED, OUT_OF_VIEW, VISIBLE, camera_to_body, marker_position, sight_of
 from coopenv.world.dynamics import move
@@ -87,6 +88,17 @@ def explain(model: Any, state: Any, world: int, vehicle: int):
 
 
 @wp.func
+def recall_readings(model: Any, state: Any, record: Any, world: int, vehicle: int, tick: int, row: int):
+    """Write what the sensors beside the camera have measured."""
+    for sensor in range(record.reading.shape[2]):
+        for target in range(model.agents):
+            reading = record.reading[row, vehicle, sensor, target]
+            if wp.isfinite(reading[0]):
+                state.reading[world, vehicle, sensor, target] = reading
+                state.reading_tick[world, vehicle, sensor, target] = tick
+
+
+@wp.func
 def recall(model: Any, state: Any, record: Any, world: int, tick: int):
     """Write the measurements of a tick, the messages that arrive, and the known truth."""
     row = row_of(record, tick)
@@ -111,6 +123,7 @@ def recall(model: Any, state: Any, record: Any, world: int, tick: int):
                 state.bearing[world, vehicle, target] = bearing
                 state.bearing_tick[world, vehicle, target] = tick - record.bearing_lag[row, vehicle]
                 state.sight[world, vehicle, target] = VISIBLE
+        recall_readings(model, state, record, world, vehicle, tick, row)
     sort_into_cells(model, state, world)
     for vehicle in range(model.vehicles):  # now that all poses are those of this tick
         explain(model, state, world, vehicle)
@@ -173,7 +186,7 @@ def record_struct(p: Precision) -> Any:
 
     @wp.struct
     class Record:
-        """K ticks, N vehicles, T targets, L landmarks, Q parameters; lengths in m."""
+        """K ticks, N vehicles, T targets, L landmarks, R sensors, Q parameters; lengths in m."""
 
         last: wp.int32  # K - 1
         drawn: wp.int32  # 1: the draws are those of the next fields
@@ -189,6 +202,7 @@ def record_struct(p: Precision) -> Any:
         bearing_lag: array("KN", wp.int32)  # ticks since the frame was exposed
         visible: array("KNT", wp.uint8)
         pan: array("KN", p.scalar)  # rad
+        reading: array("KNRT", p.vec6)  # of sensors beside the camera; NaN: not measured
         landmarks: array("KL", vec3)  # map
         inbox_tick: array("KNN", wp.int32)  # of sending, per receiver and sender; BY_RADIO: not known
         true_rotation: array("KN", mat33)  # NaN: not known
@@ -204,12 +218,12 @@ def record_struct(p: Precision) -> Any:
 class Feed:
     """The record of a world whose ticks come from outside: all of a recording, or the present one of a live source."""
 
-    def __init__(self, ticks: int, model: Any, odometry_rate: float, p: Precision, device: str) -> None:
-        """Allocate room for ticks; odometry samples come at a rate in Hz."""
+    def __init__(self, ticks: int, model: Any, scenario: Scenario, p: Precision, device: str) -> None:
+        """Allocate room for ticks of a scenario."""
         sizes = {"K": ticks, "N": model.vehicles, "T": model.agents, "L": model.landmarks, "Q": len(PARAMETERS)}
-        self.record = allocate(record_struct(p), sizes, device)
+        self._odometry_rate, self._sensors = scenario.rates.odometry, [s.label for s in scenario.sensors]
+        self.record = allocate(record_struct(p), {**sizes, "R": len(self._sensors)}, device)
         self.record.last = ticks - 1
-        self._odometry_rate = odometry_rate
         self._views: dict[str, np.ndarray] = {}
         for name in fields(record_struct(p)):
             array = getattr(self.record, name)
@@ -238,6 +252,12 @@ class Feed:
         }
         for name, value in values.items():
             self._views[name][...] = value
+        self._views["reading"][...] = np.nan
+        for d, name in enumerate(self._sensors):
+            if name in tick.readings:
+                size, targets = tick.readings[name].shape[-1], tick.readings[name].shape[-2]
+                self._views["reading"][..., d, :targets, :size] = tick.readings[name]
+                self._views["reading"][..., d, :targets, size:] = 0.0
 
     def fill_recording(self, recording: Recording) -> None:
         """Write all ticks of a recording, its initial estimates and its draws."""

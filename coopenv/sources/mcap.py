@@ -20,6 +20,7 @@ from coopenv.base.plugins import loaded, offered
 from coopenv.base.sections import validated
 from coopenv.observers.arrays import ARRAYS, recorded_names, sizes_of
 from coopenv.observers.contract import Setup
+from coopenv.observers.readings import shapes_of_readings
 from coopenv.observers.recording import Recording, check_recording, recorded_arrays
 from coopenv.observers.sensed import Truth
 from coopenv.sources.mcap_format import (
@@ -28,6 +29,7 @@ from coopenv.sources.mcap_format import (
     FORMAT,
     LANDMARKS,
     LANDMARKS_TYPE,
+    READING_TYPE,
     SHOWN,
     LogClock,
     RecordingHeader,
@@ -37,6 +39,7 @@ from coopenv.sources.mcap_format import (
     exact_topics,
     header_of,
     reading,
+    reading_topic,
     topic,
 )
 
@@ -51,7 +54,8 @@ class TickArrays:
         """Allocate the arrays of these names. Raises CoopenvError: they would not fit into memory."""
         vehicles, sizes = [setup.name for setup in setups], {"K": ticks, **sizes_of(setups)}
         shapes = {name: ARRAYS[name].shape(sizes) for name in names if ARRAYS[name].axes[0] == "K"}
-        needed = 8 * sum(math.prod(shape) for shape in shapes.values())
+        readings = {name: (ticks, *shape) for name, shape in shapes_of_readings(setups).items()}
+        needed = 8 * sum(math.prod(shape) for shape in (*shapes.values(), *readings.values()))
         check_memory(needed, f"a recording of {ticks} ticks, {len(vehicles)} vehicles and {sizes['T']} targets")
         self._shape_of_landmarks = shapes.pop("landmarks")[1:]
         shapes["due"] = (ticks, len(vehicles))
@@ -62,6 +66,13 @@ class TickArrays:
         exact = exact_topics(names)
         self._places = {topic(name, field): (field, i) for i, name in enumerate(vehicles) for field in exact}
         self.kinds = {LANDMARKS: LANDMARKS_TYPE} | {name: exact[field] for name, (field, _) in self._places.items()}
+        self._readings = {name: np.full(shape, np.nan) for name, shape in readings.items()}
+        self._rows = {
+            reading_topic(setup.name, sensor.name): self._readings[sensor.name][:, i]
+            for i, setup in enumerate(setups)
+            for sensor in setup.sensors
+        }
+        self.kinds |= dict.fromkeys(self._rows, READING_TYPE)
         """Topic to the type of its messages."""
         self._columns = {
             name: [(part, self._arrays[array][:, i]) for part, array in CONTENTS[field].items()]
@@ -79,12 +90,25 @@ class TickArrays:
             points = [[q.position.x, q.position.y, q.position.z] for q in message.poses]
             self._landmarks[k] = np.array(points, np.float64).reshape(self._shape_of_landmarks)
             return
+        if name in self._rows:
+            self._put_reading(self._rows[name][k], message)
+            return
         field, i = self._places[name]
         self._seen[name][k] = True
         if field == "bearings":
             self._put_bearings(k, i, message)
         for part, column in self._columns[name]:
             column[k] = getattr(message, part).reshape(column.shape[1:])
+
+    @staticmethod
+    def _put_reading(row: np.ndarray, m: Any) -> None:
+        """Write the message of a sensor to its row (T, size) of a tick."""
+        targets, count = m.targets, len(m.targets)
+        if len(np.unique(targets)) != count or (targets >= len(row)).any():
+            raise ValueError(f"targets are not different ones of {len(row)}")
+        if not np.isnan(row).all():
+            raise ValueError("is there twice")
+        row[targets] = m.values.reshape(count, row.shape[1])
 
     def _put_bearings(self, k: int, i: int, m: Any) -> None:
         targets, count = m.targets, len(m.targets)
@@ -110,7 +134,7 @@ class TickArrays:
         lengths = np.diff([*changes, self._ticks])
         arrays["landmarks"] = np.repeat([self._landmarks[k] for k in changes], lengths, axis=0)
         truth = Truth(arrays.pop("truth.rotation"), arrays.pop("truth.position"))
-        return {**arrays, "truth": truth}
+        return {**arrays, "truth": truth, "readings": self._readings}
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -223,6 +247,8 @@ class _Log(RosLog):
         for setup in r.setups:  # so that topics are there even if nothing is ever known
             for name, kind in {**self.exact, **SHOWN}.items():
                 self.channel(topic(setup.name, name), kind)
+            for sensor in setup.sensors:
+                self.channel(reading_topic(setup.name, sensor.name), READING_TYPE)
         changed = (r.landmarks[1:] != r.landmarks[:-1]).any(axis=(1, 2))
         moved = {0, *(np.flatnonzero(changed) + 1).tolist()}
         vehicles = [self._ticks_of(i, setup.name) for i, setup in enumerate(r.setups)]
@@ -260,10 +286,19 @@ class _Log(RosLog):
             for field, parts in columns.items():
                 row = {part: column[k] for part, column in parts.items()} or self._bearings(k, i)
                 self._send(topic(name, field), self.exact[field], k, "map" if field == "truth_exact" else name, **row)
+            self._send_readings(k, i, name)
             self._show_odometry(k, i, name, pose)
             if k in truth:
                 self._send(topic(name, "truth"), SHOWN["truth"], k, "map", pose=truth[k])
             yield k
+
+    def _send_readings(self, k: int, i: int, name: str) -> None:
+        for sensor in self.recording.setups[i].sensors:
+            values = self.recording.readings[sensor.name][k, i]
+            measured = np.flatnonzero(~np.isnan(values[:, 0]))
+            if len(measured):
+                row = {"targets": measured.astype(np.uint32), "values": values[measured].ravel()}
+                self._send(reading_topic(name, sensor.name), READING_TYPE, k, name, **row)
 
     def _bearings(self, k: int, i: int) -> dict[str, Any]:
         r = self.recording

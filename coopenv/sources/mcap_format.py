@@ -22,6 +22,7 @@ from coopenv.base.errors import CoopenvError, DataError, regular
 from coopenv.base.format import jsonable
 from coopenv.base.installation import install_command, message_types, needing, version
 from coopenv.base.sections import Number, Section, Vector3
+from coopenv.measurements.sensor import MAP, Sensor
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Drawn, Recording
 from coopenv.scenario import parse_scenario
@@ -50,6 +51,9 @@ CONTENTS = {
 """Topic to the entries of its messages that hold a vehicle's row of an array of the `Recording`; of bearings only those
 that there are hold any."""
 
+READING_TYPE = "coopenv_msgs/msg/Reading"
+"""Type of the topic of a sensor beside the camera, `reading_topic`; one message at every tick that has measurements."""
+
 SHOWN = {"odometry": "nav_msgs/msg/Odometry", "truth": "geometry_msgs/msg/PoseStamped"}
 """Topics of a vehicle that viewers understand: dead reckoning from the start, and the truth where it is known."""
 
@@ -60,6 +64,11 @@ LANDMARKS_TYPE = "geometry_msgs/msg/PoseArray"
 def topic(vehicle: str, name: str) -> str:
     """Return the full name of a vehicle's topic."""
     return f"/{vehicle}/{name}"
+
+
+def reading_topic(vehicle: str, sensor: str) -> str:
+    """Return the full name of the topic of a vehicle's sensor beside the camera."""
+    return f"/{vehicle}/sensors/{sensor}"
 
 
 def exact_topics(arrays: Collection[str]) -> dict[str, str]:
@@ -92,6 +101,14 @@ def _section_of(record: Any, **types: Any) -> Any:
     return create_model(f"{record.__name__}Header", __base__=Section, **columns)
 
 
+SensorHeader = _section_of(
+    Sensor,
+    std=tuple[Number, ...],
+    targets=tuple[Annotated[int, Field(ge=MAP, lt=2**31)], ...],
+    position=Vector3,
+    rotation=Matrix3,
+)
+Row3 = tuple[Number | None, Number | None, Number | None]  # None: not known
 SetupHeader = _section_of(
     Setup,
     landmarks=Index,
@@ -100,7 +117,11 @@ SetupHeader = _section_of(
     marker=Vector3,
     noise=_section_of(SensorNoise),
     gains=_section_of(Gains, q=tuple[Number, ...]),
+    sensors=tuple[SensorHeader, ...],  # type: ignore[valid-type]
+    landmark_rotation=tuple[tuple[Row3, Row3, Row3], ...] | None,
 )
+ONLY_WITH_SENSORS = ("sensors", "landmark_rotation")
+"""Entries of a setup that the header of a recording without sensors beside cameras does not have."""
 
 
 class RecordingHeader(Section):
@@ -138,6 +159,9 @@ class RecordingHeader(Section):
 def header_of(recording: Recording) -> bytes:
     """Return the header of a recording as JSON."""
     values = jsonable({name: getattr(recording, name) for name in RecordingHeader.model_fields})
+    for setup in values["setups"] if not recording.readings else ():
+        for name in ONLY_WITH_SENSORS:
+            del setup[name]
     if values["scenario"] is not None:
         values["scenario"] = without_own_terms(values["scenario"])
     return json.dumps(values, separators=(",", ":")).encode()
@@ -150,8 +174,20 @@ def _setup(header: Any) -> Setup:
         "marker": np.array(header.marker),
         "noise": SensorNoise(**dict(header.noise)),
         "gains": Gains(**{**dict(header.gains), "q": np.array(header.gains.q)}),
+        "sensors": tuple(_sensor(sensor) for sensor in header.sensors),
+        "landmark_rotation": header.landmark_rotation and np.array(header.landmark_rotation, float),
     }
     return Setup(**{**dict(header), **arrays})
+
+
+def _sensor(header: Any) -> Sensor:
+    arrays = {
+        "std": np.array(header.std, float),
+        "targets": np.array(header.targets, np.int64),
+        "position": np.array(header.position),
+        "rotation": np.array(header.rotation),
+    }
+    return Sensor(**{**dict(header), **arrays})
 
 
 MAGIC = b"\x89MCAP0\r\n"

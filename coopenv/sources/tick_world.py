@@ -11,9 +11,10 @@ from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import exp_so3, exp_translation
 from coopenv.observers.contract import Message, ObserverInit
 from coopenv.observers.kernel_observer import views_of
+from coopenv.observers.readings import nothing_measured
 from coopenv.observers.registry import find_embedded
-from coopenv.observers.runner import start_covariances
 from coopenv.observers.sensed import Sensed, check_tick, is_due
+from coopenv.observers.setups import start_covariances
 from coopenv.sources.base import (
     Backend,
     Broadcasting,
@@ -75,7 +76,7 @@ class TickWorld(SensingWorld):
         return model
 
     def _build_record(self) -> Any:
-        self._feed = Feed(1, self.model, self.scenario.rates.odometry, self.precision, self.device)
+        self._feed = Feed(1, self.model, self.scenario, self.precision, self.device)
         return self._feed.record
 
     def reset(self, keys: Keys = None, mask: np.ndarray | None = None, options: Options = None) -> None:
@@ -169,10 +170,14 @@ class TickWorld(SensingWorld):
         arrays["odometry_age"][missing] = last.filled("odometry_age")[missing] + tick.dt
         arrays["visible"][missing] = False
         arrays["bearings"][~arrays["visible"]] = np.nan
-        for values in arrays.values():
+        readings = nothing_measured(self.observer_init.setups)
+        for name, values in readings.items():
+            values[~missing] = tick.readings.get(name, values)[~missing]
+        for values in (*arrays.values(), *readings.values()):
             values.setflags(write=False)
         due = bool(is_due(tick.index, self.model.observer.rate / self.scenario.rates.camera))
-        return replace(tick, **arrays, missing=missing, late=np.array(tick.filled("late"), bool), due=due)
+        late = np.array(tick.filled("late"), bool)
+        return replace(tick, **arrays, readings=readings, missing=missing, late=late, due=due)
 
     def _receive(self) -> None:
         """Put messages from vehicles that are estimated elsewhere into the inboxes; malformed ones are as none."""
@@ -252,4 +257,5 @@ def _nothing(observer_init: ObserverInit) -> Sensed:
         visible=np.zeros((N, T), bool),
         landmarks=np.zeros((observer_init.setups[0].landmarks, 3)),
         odometry_age=np.full(N, np.inf),
+        readings=nothing_measured(observer_init.setups),
     )

@@ -1,5 +1,6 @@
 """Backends of many worlds at once: the simulation, and the replay of a recording in a scenario that is made of it."""
 
+import json
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -9,15 +10,17 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import CoopenvError, DataError, ScenarioWarning
 from coopenv.estimation import Sight
 from coopenv.observers.arrays import ARRAYS
-from coopenv.observers.contract import ObserverInit
+from coopenv.observers.contract import ObserverInit, Setup, sealed
 from coopenv.observers.recording import Recording, check_recording
 from coopenv.observers.registry import find_embedded
-from coopenv.observers.runner import start_covariances
 from coopenv.observers.sensed import Sensed, Truth, is_due
+from coopenv.observers.setups import start_covariances
 from coopenv.scenario import Scenario, parse_scenario
 from coopenv.scenario.files import override
 from coopenv.scenario.schema import neighbour_sets, processing_order
@@ -60,7 +63,17 @@ class SimulatedWorld(SensingWorld):
         for values in arrays.values():
             values.setflags(write=False)
         due = bool(is_due(k, self.model.observer.rate / rates.camera))
-        return Sensed(index=k, dt=1.0 / rates.camera, due=due, **arrays)
+        return Sensed(index=k, dt=1.0 / rates.camera, due=due, readings=self._readings(world, k), **arrays)
+
+    def _readings(self, world: int, k: int) -> dict[str, np.ndarray]:
+        """Return what the sensors beside the camera have measured at tick k, by name."""
+        readings = {}
+        for d, section in enumerate(self.scenario.sensors):
+            entries = slice(None) if section.made.has_target else slice(1)
+            measured = self.view("reading_tick")[world, :, d, entries] == k
+            values = np.array(self.view("reading")[world, :, d, entries, : section.made.size], dtype=float)
+            readings[section.label] = sealed(np.where(measured[..., None], values, np.nan))
+        return readings
 
     def full_tick(self, k: int) -> Sensed:
         """Return the tick of the first world with truth and deliveries."""
@@ -218,6 +231,7 @@ def _of_robots(recording: Recording, name: str) -> dict[str, Any]:
             "bearing": {"model": "isotropic", "scale": noise.bearing},
             "slip": dict(zip(("rate", "duration", "size", "angle"), noise.slip, strict=True)),
         },
+        "sensors": _sensor_sections(recording.setups),
         "topology": {"mode": "sensed", "acyclic": False},
         "v2x": {"period": recording.period, "staleness": staleness},
         "observer": {
@@ -228,15 +242,40 @@ def _of_robots(recording: Recording, name: str) -> dict[str, Any]:
     }
 
 
+def _sensor_sections(setups: Sequence[Setup]) -> list[dict[str, Any]]:
+    """Return plain data of the sensors beside the camera that robots have."""
+    sections: dict[str, dict[str, Any]] = {}
+    for setup in setups:
+        for sensor in setup.sensors:
+            section = sections.setdefault(
+                sensor.name,
+                {
+                    "kind": sensor.reference,
+                    "name": sensor.name,
+                    "vehicles": [],
+                    "towards": ["landmarks", "vehicles"] if sensor.kind.has_target else ["map"],
+                    "position": sensor.position.tolist(),
+                    "orientation": Rotation.from_matrix(sensor.rotation).as_quat(scalar_first=True).tolist(),
+                    "noise": sensor.std.tolist(),
+                    "options": json.loads(sensor.options),
+                },
+            )
+            section["vehicles"].append(setup.name)
+    return [*sections.values()]
+
+
 def of_robots(recording: Recording, kept: Sequence[int]) -> Recording:
     """Return a recording in which the robots that are not kept have no neighbours and no truth."""
     out = np.array([i not in kept for i in range(len(recording.setups))])
     gone, seen = recording.setups[0].landmarks + np.flatnonzero(out), recording.visible.copy()
     seen[:, out], seen[..., gone] = False, False
     setups = tuple(
-        replace(setup, targets=np.setdiff1d(setup.targets, gone) if i in kept else setup.targets[:0])
-        for i, setup in enumerate(recording.setups)
+        without_targets(setup, gone if i in kept else setup.targets) for i, setup in enumerate(recording.setups)
     )
+    readings = {name: np.array(values) for name, values in recording.readings.items()}
+    for values in readings.values():
+        values[:, out] = np.nan
+        values[:, :, gone if values.shape[2] == seen.shape[2] else []] = np.nan
     truth = Truth(*(np.array(values) for values in (recording.truth.rotation, recording.truth.position)))
     truth.rotation[:, out], truth.position[:, out] = np.nan, np.nan
     scenario, order = without_robots(recording.scenario, kept), recording.order
@@ -244,8 +283,21 @@ def of_robots(recording: Recording, kept: Sequence[int]) -> Recording:
         order = tuple(processing_order(scenario, neighbour_sets(scenario)))
     bearings = np.where(seen[..., None], recording.bearings, np.nan)
     return replace(
-        recording, setups=setups, visible=seen, bearings=bearings, truth=truth, scenario=scenario, order=order
+        recording,
+        setups=setups,
+        visible=seen,
+        bearings=bearings,
+        readings=readings,
+        truth=truth,
+        scenario=scenario,
+        order=order,
     )
+
+
+def without_targets(setup: Setup, gone: NDArray[np.int64]) -> Setup:
+    """Return a setup whose vehicle measures none of some targets, with any sensor."""
+    sensors = tuple(replace(sensor, targets=sensor.targets[~np.isin(sensor.targets, gone)]) for sensor in setup.sensors)
+    return replace(setup, targets=np.setdiff1d(setup.targets, gone), sensors=sensors)
 
 
 def without_robots(scenario: Any, kept: Sequence[int]) -> Any:
@@ -290,7 +342,8 @@ def stretch(recording: Recording, first: int, last: int, where: str) -> Recordin
             moved = now[0] @ begin[0].T
             R[i], p[i] = moved @ R[i], now[1] + moved @ (p[i] - begin[1])
         arrays |= {"start_rotation": R, "start_position": p}
-    return replace(recording, truth=Truth(truth.rotation[cut], truth.position[cut]), **arrays)
+    truth = Truth(truth.rotation[cut], truth.position[cut])
+    return replace(recording, truth=truth, readings=recording.readings_at(cut), **arrays)
 
 
 class ReplayWorld(SensingWorld):
@@ -321,8 +374,7 @@ class ReplayWorld(SensingWorld):
         return model
 
     def _build_record(self) -> Any:
-        rate = self.scenario.rates.odometry
-        feed = Feed(self._recording.ticks, self.model, rate, self.precision, self.device)
+        feed = Feed(self._recording.ticks, self.model, self.scenario, self.precision, self.device)
         feed.fill_recording(self._recording)
         return feed.record
 

@@ -20,6 +20,7 @@ from coopenv.scenario.routes import Signal, compile_motion, even_points, followe
 from coopenv.scenario.schema import agent_starts, most_boxes, neighbour_sets, processing_order
 from coopenv.scenario.sensing import Camera, Faults, Noise, Rates, rotation_of
 from coopenv.world.model import BLIND, DRIVEN, IDEAL, PRESCRIBED, SENSED, STATIC, Precision, entry_struct, model_struct
+from coopenv.world.sensors import sensor_entries, sensor_tables
 from coopenv.world.warp_internals import field_types, scalar_of
 
 NO_SIGNAL = Signal(at=0.0, period=1.0, green=1.0)
@@ -127,6 +128,7 @@ def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
     on = float(noise.enabled)
     return {
         "rotation": c.to_body(),
+        "absent": c.model == "none",
         "pinhole": c.model == "pinhole",
         **dict(zip(("k1", "k2", "p1", "p2", "k3"), c.distortion, strict=True)),
         "max_radius": largest_radius(c.distortion),
@@ -211,6 +213,11 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
                 made[key] = kind()
                 _fill(made[key], device, values(i), sections[i])
         setattr(model, name, wp.array([made[key] for key in keys], dtype=kind, device=device))
+    sensors = [entry_struct(p, "sensor")() for _ in scenario.sensors]
+    for made, section in zip(sensors, scenario.sensors, strict=True):
+        _fill(made, device, sensor_entries(section, scenario))
+    _fill(model, device, sensor_tables(scenario))
+    model.sensor = wp.array(sensors, dtype=entry_struct(p, "sensor"), device=device)
     return model
 
 
@@ -362,6 +369,7 @@ def _scene(scenario: Scenario) -> dict[str, Any]:
         "body_half": [np.array(body.size) / 2 if body else NOWHERE for body in bodies],
         "body_center": [body.center if body else NOWHERE for body in bodies],
         "marker": [agent.marker for agent in everyone],
+        "anchor": [*(mark.anchor for mark in scenario.landmarks), *(False for _ in scenario.vehicles)],
         "obstacle_rotation": [rotation_of(obstacle.yaw, None) for obstacle in scenario.obstacles],
         "obstacle_center": [np.array(obstacle.center) - origin for obstacle in scenario.obstacles],
         "obstacle_half": [np.array(obstacle.size) / 2 for obstacle in scenario.obstacles],

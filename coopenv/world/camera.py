@@ -264,7 +264,7 @@ def sight_of(model: Any, state: Any, world: int, vehicle: int, target: int, orig
     """
     if state.present[world, target] == 0 or state.present[world, model.landmarks + vehicle] == 0:
         return OUT_OF_VIEW
-    if model.sensing == BLIND:
+    if model.sensing == BLIND or model.camera[vehicle].absent == 1 or model.scene.anchor[target] == 1:
         return OUT_OF_VIEW
     if model.sensed == 1 and model.sensing != IDEAL:
         camera = model.camera[vehicle]

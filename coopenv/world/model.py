@@ -24,13 +24,14 @@ class Precision:
     vec2: Any
     vec3: Any
     vec5: Any
+    vec6: Any
     mat33: Any
     mat66: Any
 
 
 def _precision(scalar: Any) -> Precision:
     vector, matrix, number = wp.types.vector, wp.types.matrix, wp.dtype_to_numpy(scalar)
-    small = vector(2, scalar), vector(3, scalar), vector(5, scalar), matrix((3, 3), scalar)
+    small = vector(2, scalar), vector(3, scalar), vector(5, scalar), vector(6, scalar), matrix((3, 3), scalar)
     return Precision(scalar.__name__, scalar, number, *small, matrix((6, 6), scalar))
 
 
@@ -83,7 +84,7 @@ mat66d: Any = wp.types.matrix((6, 6), wp.float64)
 @cache
 def model_struct(p: Precision) -> Any:
     """Return the Warp struct of the model in one precision."""
-    scalar, vec2, vec3, mat33 = p.scalar, p.vec2, p.vec3, p.mat33
+    scalar, vec2, vec3, vec6, mat33 = p.scalar, p.vec2, p.vec3, p.vec6, p.mat33
 
     @wp.struct
     class StartValues:
@@ -147,6 +148,7 @@ def model_struct(p: Precision) -> Any:
         body_half: wp.array(dtype=vec3)  # (A,) m
         body_center: wp.array(dtype=vec3)  # (A,) body frame, m
         marker: wp.array(dtype=vec3)  # (A,) body frame, m
+        anchor: wp.array(dtype=wp.int32)  # (A,) 1: cameras do not see it
         obstacle_rotation: wp.array(dtype=mat33)  # (O,)
         obstacle_center: wp.array(dtype=vec3)  # (O,) m
         obstacle_half: wp.array(dtype=vec3)  # (O,) m
@@ -219,6 +221,7 @@ def model_struct(p: Precision) -> Any:
 
         rotation: mat33  # camera to body
         position: vec3  # body frame, m
+        absent: wp.int32  # 1: there is no camera
         pinhole: wp.int32
         image_size: vec2  # pixels
         focal_length: vec2  # pixels
@@ -255,6 +258,28 @@ def model_struct(p: Precision) -> Any:
         slip_duration: scalar  # s
         slip_size: scalar
         slip_angle: scalar  # rad
+
+    @wp.struct
+    class SensorValues:
+        """A sensor beside the camera; rows beyond its kind's are zero."""
+
+        rotation: mat33  # sensor to body
+        position: vec3  # body frame, m
+        has_target: wp.int32  # 0: it measures the map
+        ratio: wp.float64  # measurements per tick, at most 1
+        std: vec6  # of white noise
+        bias: vec6  # standard deviations of an error per vehicle and episode
+        correlated: vec6  # standard deviations of a Gauss-Markov process
+        correlation: scalar  # of that with itself one tick later
+        outlier: vec6  # mean size
+        outlier_probability: scalar
+        miss_probability: scalar
+        outage_share: scalar  # of time in outages
+        outage_correlation: scalar  # of being in an outage with the same one tick later
+        range: scalar  # m; infinity: unlimited
+        least_cosine: scalar  # of the angle between its x axis and a target in its field of view
+        occluded: wp.int32
+        under_sky: wp.int32  # 1: a building above it occludes the map
 
     @wp.struct
     class Radio:
@@ -378,6 +403,9 @@ def model_struct(p: Precision) -> Any:
         drawn: DrawRanges
         camera: wp.array(dtype=CameraValues)  # (N,)
         noise: wp.array(dtype=NoiseValues)  # (N,)
+        sensor: wp.array(dtype=SensorValues)  # (R,) beside cameras
+        carries: wp.array2d(dtype=wp.int32)  # (N, R) 1: a vehicle has a sensor
+        measures: wp.array2d(dtype=wp.int32)  # (R, A) 1: a sensor measures an agent
         fault: wp.array(dtype=FaultValues)  # (N,)
         clocks: wp.int32  # 1: some clock is off
         restarts: wp.int32  # 1: some vehicle may restart

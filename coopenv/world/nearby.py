@@ -222,6 +222,8 @@ def clear_entry(state: Any, world: int, vehicle: int, entry: int):
     state.bearing[world, vehicle, entry] = o
     state.bearing_tick[world, vehicle, entry] = -1
     state.sight[world, vehicle, entry] = NOT_A_NEIGHBOUR
+    for sensor in range(state.reading_tick.shape[2]):
+        state.reading_tick[world, vehicle, sensor, entry] = -1
 
 
 @device_function

@@ -46,6 +46,9 @@ CORRUPTION = wp.constant(wp.uint32(44))
 MAP_ERROR = wp.constant(wp.uint32(46))
 JAMMER = wp.constant(wp.uint32(47))
 """For six numbers, the next stream gives the second half."""
+SENSOR = wp.constant(wp.uint32(64))
+STREAMS_PER_SENSOR = wp.constant(wp.uint32(16))
+"""Streams of sensors beside the camera: the first, and how many each one has, see `coopenv.world.sensors`."""
 
 
 @wp.func

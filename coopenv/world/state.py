@@ -4,7 +4,8 @@ W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders)
 the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q parameters, U numbers of an action, Z bodies
 of the traffic, G cells of the grid, I items in it. Measurements and messages have
 X entries, one per agent, and Y boxes, one per sender, or as many as are kept (V), see `coopenv.world.nearby`; E agents
-that may be off on maps. L lanes of scratch: indexed by vehicle, shared by the vehicles that one thread takes in turn.
+that may be off on maps. R sensors beside the camera. L lanes of scratch: indexed by vehicle, shared by the vehicles
+that one thread takes in turn.
 
 A field of a record states its axes once, a letter each, and is allocated by them. It also states the rule of its saved
 values; all rules are checked before anything is restored.
@@ -279,7 +280,8 @@ def _converted(name: str, values: Mapping[str, Any], like: Array) -> Array:
 @cache
 def state_struct(p: Precision) -> Any:
     """Return the Warp struct of the state in one precision."""
-    scalar, vec2, vec3, vec5, mat33, mat66 = p.scalar, p.vec2, p.vec3, p.vec5, p.mat33, p.mat66
+    scalar, vec2, vec3, vec5, vec6 = p.scalar, p.vec2, p.vec3, p.vec5, p.vec6
+    mat33, mat66 = p.mat33, p.mat66
 
     @wp.struct
     class State:
@@ -354,6 +356,11 @@ def state_struct(p: Precision) -> Any:
         bearing_tick: array("WNX", wp.int32, TICK)  # tick of that bearing; -1: never
         sight: array("WNX", wp.uint8, whole(min(Sight), max(Sight)))  # values of `Sight`
 
+        reading: array("WNRX", vec6)  # last value of a sensor beside the camera; of the map: in the first entry
+        reading_tick: array("WNRX", wp.int32, TICK)  # tick of that value; -1: never
+        sensor_drift: array("WNR", vec6, TRUTH)  # truth: correlated error of its rows
+        sensor_outage: array("WNR", wp.int32, FLAG)  # truth: 1: it measures nothing for a while
+
         outbox_rotation: array("WNS", mat33, ROTATION)  # Rhat as sent
         outbox_position: array("WNS", vec3)  # Rhat phat as sent, map
         outbox_tick: array("WNS", wp.int32, TICK)  # -1: nothing sent in this slot
@@ -415,8 +422,14 @@ def state_sizes(model: Any, worlds: int) -> dict[str, int]:
     }
     grid = {"G": model.cells.across**2, "I": model.agents + model.traffic}
     ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
-    draws = {"P": model.routes.points, "Q": len(PARAMETERS), "Z": model.traffic, "U": model.action_size}
-    return {"W": worlds, "A": A, "N": N, "L": N, **draws, **ticks, **grid, **near}
+    draws = {
+        "R": model.sensor.shape[0],
+        "P": model.routes.points,
+        "Q": len(PARAMETERS),
+        "Z": model.traffic,
+        "U": model.action_size,
+    }
+    return {"W": worlds, "A": A, "N": N, "L": N, "R": model.sensor.shape[0], **draws, **ticks, **grid, **near}
 
 
 def allocate_state(model: Any, worlds: int, p: Precision, device: str, shared: str = "") -> Any:

@@ -19,6 +19,7 @@ from coopenv.world.launch import VEHICLES_PER_LEVEL, Call, Launcher, PerLane, Pe
 from coopenv.world.model import check_device, device_memory, mat66d, precision
 from coopenv.world.quality import COORDINATES
 from coopenv.world.random import NOT_SET
+from coopenv.world.sensor_stage import SensorStage
 from coopenv.world.state import (
     ANYTHING,
     SCRATCH,
@@ -141,6 +142,10 @@ class World:
         self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         """(W,) worlds that `restart` resets and that `advance` leaves alone; zero between calls."""
         self.launch = Launcher(worlds, self.device, dtype, shares, lanes, needed // worlds)
+        self.sensors = None
+        """Stage of the sensors beside the camera; None: there are none, or the source gives their readings."""
+        if scenario.sensors and self.source.knows_truth:
+            self.sensors = SensorStage(scenario, self.model, self.state, self.mask, self.precision)
         self._views: dict[str, np.ndarray] = {}
 
     def _build_model(self) -> Any:
@@ -207,13 +212,16 @@ class World:
     @property
     def _world_kernels(self) -> Kernels:
         """Kernels of the source with the observer, or without it."""
-        if self.observer.fused and self.source.fused and self.launch.lanes == 1:
+        if self.observer.fused and self.source.fused and self.launch.lanes == 1 and self.sensors is None:
             return fused_kernels(self.source, self.observer, self.precision)
         return source_kernels(self.source, self.precision)
 
     def restart(self) -> None:
         """Start the next episode in the worlds of `self.mask`, on the device."""
         self._run("begin", self._world_kernels["begin"], self._record, PerWorld(self.mask))
+        if self.sensors is not None:
+            self.launch.by_lane("begin sensors", *self.sensors.calls(begins=True))
+            self.sensors.compute(begins=True)
         if self.observer.starts:
             start = observer_kernels(self.observer, self.precision)["start"]
             self._run("start", start, PerWorld(self.memory), PerWorld(self.mask))
@@ -225,14 +233,14 @@ class World:
         memory, hold = PerWorld(self.memory), PerWorld(self.mask)
         self._revive(ticks)
         sensing = self._world_kernels
-        if self.launch.lanes > 1 or (self.in_parts and self.model.radio.delay == 0):
+        if self.launch.lanes > 1 or self._computes or (self.in_parts and self.model.radio.delay == 0):
             self._advance_in_lanes(ticks)
         elif "advance" in sensing:
             arguments = [memory, self._record, PerWorld(self.actions), hold, ticks]
             self._run(("advance", ticks), sensing["advance"], *arguments)
         else:
             decide = sensing["decide"], [self.model, PerWorld(self.state), PerWorld(self.actions), hold]
-            self.launch.decision(("advance", ticks), ticks, decide, self._sense(SENSE), *self._follow(1))
+            self.launch.decision(("advance", ticks), ticks, decide, *self._look(SENSE), *self._follow(1))
         if self.device == "cpu":  # reading from a GPU would wait for it
             self.check_room()
 
@@ -247,10 +255,10 @@ class World:
         self.decide()
         for _ in range(ticks):
             self._move()
-            if self.model.radio.delay > 0:
-                self.launch.by_lane("look and follow", self._sense(LOOK), *self._follow())
+            if self.model.radio.delay > 0 and not self._computes:
+                self.launch.by_lane("look and follow", *self._look(LOOK), *self._follow())
             else:
-                self.launch.by_lane("look", self._sense(LOOK))
+                self._look_around()
                 self._follow_by_level()
             self.finish()
 
@@ -292,6 +300,21 @@ class World:
         """Return the launch of stages of a tick before observers."""
         sense = source_kernels(self.source, self.precision)["sense"]
         return sense, [self.model, PerWorld(self.state), self._record, PerWorld(self.mask), stages]
+
+    def _look(self, stages: int) -> list[Call]:
+        """Return the launches of stages of a tick before observers, and of the sensors beside the camera."""
+        return [self._sense(stages), *(self.sensors.calls() if self.sensors is not None else [])]
+
+    @property
+    def _computes(self) -> bool:
+        """True if the host computes what some sensors measure."""
+        return self.sensors is not None and len(self.sensors.own) > 0
+
+    def _look_around(self) -> None:
+        """Measure after everything has moved, in lanes."""
+        self.launch.by_lane("look", *self._look(LOOK))
+        if self.sensors is not None:
+            self.sensors.compute()
 
     def _follow(self, ends: int = 0, turns: Any = None) -> list[Call]:
         """Return the launches of the observers, in turn; with `ends` the last one ends the tick."""
@@ -341,10 +364,12 @@ class World:
     def sense(self) -> None:
         """Move the truth to the next tick and measure it."""
         if self.launch.lanes == 1:
-            self.launch.by_lane("sense", self._sense(SENSE))
+            self.launch.by_lane("sense", *self._look(SENSE))
+            if self.sensors is not None:
+                self.sensors.compute()
         else:
             self._move()
-            self.launch.by_lane("look", self._sense(LOOK))
+            self._look_around()
 
     def receive(self, vehicle: int) -> None:
         """Let a vehicle receive the messages arriving at this tick."""

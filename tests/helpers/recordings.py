@@ -53,6 +53,8 @@ def differences(a: Any, b: Any, where: str = "") -> list[str]:
         return [d for f in fields(a) for d in differences(getattr(a, f.name), getattr(b, f.name), f"{where}.{f.name}")]
     if isinstance(a, tuple) and isinstance(b, tuple) and len(a) == len(b):
         return [d for i, (x, y) in enumerate(zip(a, b, strict=True)) for d in differences(x, y, f"{where}.{i}")]
+    if isinstance(a, dict) and isinstance(b, dict) and a.keys() == b.keys():
+        return [d for name in a for d in differences(a[name], b[name], f"{where}.{name}")]
     return [] if type(a) is type(b) and a == b else [where]
 
 

@@ -14,16 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.compiled import adjoint
 from coopenv.observers import Coordinates, Run, SensorNoise, Tick, run
-from coopenv.observers.bearing_measurements import (
-    LEFT,
-    RIGHT,
-    BearingMeasurements,
-    UncertainPose,
-    linearise,
-)
 from coopenv.observers.correction import gain, joseph
 from coopenv.observers.covariance_intersection import CovarianceIntersection, best_split_weight, best_weight
+from coopenv.observers.frame import UsableMeasurements, linearise
 from coopenv.observers.registry import find
+from coopenv.observers.uncertain_pose import LEFT, RIGHT, UncertainPose
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.helpers.recordings import completed
@@ -252,7 +247,7 @@ def test_covariance_intersection_of_one_bearing_is_the_best_of_all_weights() -> 
         N = 1e-4 * np.eye(2) + G @ C @ G.T / (1 - w)
         return -np.linalg.slogdet(w * np.linalg.inv(P) + H.T @ np.linalg.inv(N) @ H)[1]
 
-    fused.fuse_neighbour(heard, BearingMeasurements(b, z, C[None], np.array([3]), (None,)))
+    fused.fuse_neighbour(heard, UsableMeasurements(b, z, C[None], np.array([3]), (None,)))
     best = min(log_determinant(w) for w in np.linspace(0.001, 0.999, 999))
     assert_allclose(np.linalg.slogdet(fused.state.P)[1], best, atol=0.02)
     assert best < np.linalg.slogdet(P)[1] - 0.05
@@ -308,7 +303,7 @@ def test_split_intersection_is_consistent_for_any_correlation_of_the_dependent_p
     own = variance * np.eye(2)
     H, G = rng.normal(size=(2, 6)), rng.normal(size=(2, 3))
     R_d = G @ C @ G.T
-    w = best_split_weight(P_d, P_i, H, R_d + own, variance)
+    w = best_split_weight(P_d, P_i, H, R_d + own, own)
     if w == 1.0:
         return
     P_1, P_2 = P_d / w + P_i, R_d / (1 - w) + own
@@ -324,7 +319,7 @@ def test_without_dependent_parts_it_is_the_kalman_filter() -> None:
     """The first time that a follower hears its leader, nothing of its own is shared: w goes to its least."""
     rng = np.random.default_rng(0)
     P, H, R_d = spd(rng, 6), rng.normal(size=(2, 6)), spd(rng, 2)
-    w = best_split_weight(np.zeros((6, 6)), P, H, R_d + np.eye(2), 1.0)
+    w = best_split_weight(np.zeros((6, 6)), P, H, R_d + np.eye(2), np.eye(2))
     assert_allclose(R_d / (1 - w), R_d, rtol=0.03)
     made = small_record(1)
     split, plain = run("split_covariance_intersection", made), run("mekf_covariance", made)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.poses import right_jacobian
 from coopenv.observers import Message, Received, Recording, run
-from coopenv.observers.bearing_measurements import linearise
+from coopenv.observers.frame import linearise
 from coopenv.observers.schmidt_kalman import Pairwise, SchmidtKalman
 from coopenv.observers.schmidt_kalman import considered as update
 from coopenv.runs.recorder import record

@@ -17,7 +17,7 @@ from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import ActionError, ScenarioError
 from coopenv.estimation import Sight
-from coopenv.observers.runner import observer_init_of
+from coopenv.observers.setups import observer_init_of
 from coopenv.policies.base import decide, random_policy, zero_policy
 from coopenv.runs import record
 from coopenv.scenario import Scenario, load_scenario, parse_scenario

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from coopenv.api.terms.readings import reading_fields
 from coopenv.base.errors import CoopenvError, check_one_of, listed
 from coopenv.motions.table import MOTIONS, columns_of
 from coopenv.scenario import Scenario
 from coopenv.scenario.dynamics import Dynamics
-from coopenv.scenario.terms import GROUPS, OBSERVATION_FIELDS, SETTINGS, SETTINGS_OF_ACTIONS, ObservationField
+from coopenv.scenario.terms import GROUPS, OBSERVATION_FIELDS, READINGS, SETTINGS, SETTINGS_OF_ACTIONS, ObservationField
 
 if TYPE_CHECKING:
     from gymnasium import spaces
@@ -98,8 +99,8 @@ def included_fields(scenario: Scenario) -> dict[str, ObservationField]:
         CoopenvError: one is not known in this process, or none is left.
     """
     wanted, unwanted = scenario.observation.include, scenario.observation.exclude
-    known = OBSERVATION_FIELDS.known(scenario.observation.custom)
-    by_group: dict[str, dict[str, ObservationField]] = {}
+    known = {**OBSERVATION_FIELDS.known(scenario.observation.custom), **reading_fields(scenario)}
+    by_group: dict[str, dict[str, ObservationField]] = {READINGS: {}}
     for name, row in known.items():
         by_group.setdefault(row.group or name, {})[name] = row
     for name, row in known.items():

@@ -22,7 +22,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.estimation import Outcome
 from coopenv.scenario import Scenario
 from coopenv.scenario.own_terms import record_count
-from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS, TERMINATION_CONDITIONS, Registry, TermRow
+from coopenv.scenario.terms import OBSERVATION_FIELDS, READINGS, REWARD_TERMS, TERMINATION_CONDITIONS, Registry, TermRow
 from coopenv.world import launch
 from coopenv.world.launch import PerWorld, compiler_options
 from coopenv.world.route import UNDER_WAY
@@ -253,7 +253,7 @@ def _kernel(function: Callable[..., None]) -> wp.Kernel:
 def _own_terms(scenario: Scenario, layout: Layout) -> Iterator[OwnTerm]:
     """Yield the user terms of a scenario: fields, reward terms, and conditions."""
     for name, row in included_fields(scenario).items():
-        if name not in OBSERVATION_FIELDS.built_in:
+        if name not in OBSERVATION_FIELDS.built_in and row.group != READINGS:
             field, returns = layout[name], "a number" if row.size == 1 else f"a vector of {row.size}"
             bound = _bound(OBSERVATION_FIELDS, name, row, (1 if row.per == "vehicle" else 2,))
             term = OwnTerm(*bound, field_kernel, field.start, returns, center=field.center, scale=field.scale)

@@ -22,6 +22,7 @@ from coopenv.api.terms.geometry import (
     target_record,
 )
 from coopenv.api.terms.layout import Layout, entries_of, included_fields
+from coopenv.api.terms.readings import ReadingEntry, reading_entries, write_readings
 from coopenv.api.terms.records import (
     DEGREES,
     EIGENVALUE_FLOOR,
@@ -39,7 +40,7 @@ from coopenv.api.terms.records import (
 )
 from coopenv.estimation.linalg import rotation_angle
 from coopenv.scenario import Scenario
-from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
+from coopenv.scenario.terms import OBSERVATION_FIELDS, READINGS, REWARD_TERMS
 from coopenv.world.model import DRIVEN, Precision
 from coopenv.world.quality import (
     cholesky_of,
@@ -133,6 +134,7 @@ class TermTable:
     target: wp.array(dtype=Entry)
     neighbour: wp.array(dtype=Entry)
     landmark: wp.array(dtype=Entry)
+    reading: wp.array(dtype=ReadingEntry)
     weights: wp.array(dtype=wp.float32)  # of the built-in reward terms
     route: wp.bool  # whether anything needs the route as seen from the estimate
     clearance: wp.bool  # whether the closest approach to neighbours is asked for
@@ -148,6 +150,8 @@ def results_table(scenario: Scenario, layout: Layout, device: str) -> Any:
     groups, own = set(), False
     for name, row in included_fields(scenario).items():
         field, kept = layout[name], entries_of(row, scenario)
+        if row.group == READINGS:
+            continue
         needed[row.per] = field.shape[0] if row.per != "vehicle" else 0
         groups.add(field.group)
         if name not in OBSERVATION_FIELDS.built_in:
@@ -157,11 +161,13 @@ def results_table(scenario: Scenario, layout: Layout, device: str) -> Any:
             (SOURCES[name] + entry, field.start + k, len(kept), field.center, 1.0 / field.scale)
             for k, entry in enumerate(kept)
         ]
+    readings = np.array(reading_entries(scenario, layout), dtype=ReadingEntry.numpy_dtype())
     weights = scenario.reward.by_name
     own = own or bool(scenario.termination.own) or len(weights) > len(REWARD_TERMS.built_in)
     table = TermTable()
     for per, rows in entries.items():
         setattr(table, per, wp.array(np.array(rows, dtype=Entry.numpy_dtype()), dtype=Entry, device=device))
+    table.reading = wp.array(readings, dtype=ReadingEntry, device=device)
     built_in = [weights[name] for name in REWARD_TERMS.built_in]
     table.weights = wp.array(built_in, dtype=wp.float32, device=device)
     table.clearance = "clearance" in groups
@@ -338,6 +344,7 @@ def step_results(
         write_entries(results.observation, world, vehicle, n, table.neighbour, values)
         if records.neighbour.shape[2] > 0:
             records.neighbour[world, vehicle, n] = neighbour
+    write_readings(model, state, results.observation, world, vehicle, table.reading)
     landmark = MapLandmark()
     landmark.distance = -1.0
     for n in range(table.landmarks):

@@ -85,6 +85,7 @@ def _start(recording: Recording) -> Recording:
         recording,
         truth=Truth(recording.truth.rotation[early], recording.truth.position[early]),
         due=recording.due[early],
+        readings=recording.readings_at(early),
         **{name: values[early] for name, values in recording.per_tick().items()},
     )
 

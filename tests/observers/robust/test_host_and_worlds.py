@@ -20,7 +20,7 @@ from coopenv.observers import Recording
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.contract import Message, Received
 from coopenv.observers.robust.constants import MAX_MEMBERS, MEAN_TIME
-from coopenv.observers.runner import start_covariances
+from coopenv.observers.setups import start_covariances
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.helpers.env_suite import ALIKE, SHIPPED, largest_slow, rest_slow

@@ -1,0 +1,133 @@
+"""A sensor of a vehicle: a kind of measurement with a mounting, noise and targets; its measurements of one tick."""
+
+import json
+import math
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coopenv.base.errors import check_one_of
+from coopenv.base.installation import is_reference
+from coopenv.estimation.poses import Array, skew
+from coopenv.measurements.kinds import KINDS, Kind, Placed
+
+MAP = -1
+"""Target of a kind that measures the map."""
+
+
+def kind_of(reference: str, options: str = "{}") -> Kind:
+    """Return a kind by name, or a user's class by `file.py:Class` with arguments in JSON.
+
+    Raises:
+        CoopenvError: there is no such kind, or the class is not as it should be.
+    """
+    if is_reference(reference):
+        from coopenv.measurements.own import OwnKind  # which most programs do not need
+
+        return OwnKind(reference, json.loads(options))
+    return _shipped(reference)
+
+
+@cache
+def _shipped(name: str) -> Kind:
+    check_one_of("unknown kind of sensor", name, KINDS)
+    module, _, kind = KINDS[name].partition(":")
+    made: Kind = getattr(import_module(f"{__package__}.{module}"), kind)()
+    return made
+
+
+def averaged_std(white: Array, correlated: float, time: float, period: float) -> Array:
+    """Return standard deviations (rows,) of white noise that averages as noise with a correlated part does.
+
+    A Gauss-Markov error of correlation time T, sampled every `period` s with r = exp(-period / T), counts in a long
+    mean as white noise of (1 + r) / (1 - r) times its variance.
+    """
+    r = math.exp(-period / time)
+    return np.sqrt(np.square(white) + correlated**2 * (1.0 + r) / (1.0 - r))
+
+
+class LinearRows(NamedTuple):
+    """Linearised measurements of one sensor, m of them; what cannot be used has zero derivatives and unit noise."""
+
+    residual: Array  # (m, rows)
+    by_own: Array  # (m, rows, 6) by the left error of the own pose: turn and shift, both in body axes, rad and m
+    by_target: Array  # (m, rows, 6) by a turn of the target about its own axes, rad, and its shift in map axes, m
+    noise: Array  # (m, rows) variances
+    used: NDArray[np.bool_]  # (m, rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """A sensor of one vehicle, as the vehicle knows it."""
+
+    name: str
+    reference: str  # of its kind, see `kind_of`
+    std: Array  # (rows,) of its noise as a filter counts it, in the units of the rows
+    targets: NDArray[np.int64]  # (m,) which it may measure: indices of targets, or `MAP` alone
+    position: Array  # (3,) in the body frame, m
+    rotation: Array  # (3, 3) sensor to body
+    options: str = "{}"  # arguments of a user's class, JSON
+
+    @property
+    def kind(self) -> Kind:
+        """What it measures."""
+        return kept_kind(self.reference, self.options)
+
+    def placed(self, R: Array, p: Array, velocity: Array, angular_velocity: Array, landmarks: Any = None) -> Placed:
+        """Return where it is on a body at R (..., 3, 3), p (..., 3) with a twist (..., 3) in body axes."""
+        turned = R @ self.rotation
+        at_sensor = velocity + np.cross(angular_velocity, self.position)
+        return Placed(
+            p + (R @ self.position[:, None])[..., 0] if R.ndim > 2 else p + R @ self.position,
+            turned,
+            np.asarray((R @ at_sensor[..., None])[..., 0]),
+            angular_velocity @ self.rotation,
+            landmarks or {},
+        )
+
+    def linearised(self, R: Array, own: Placed, target: Placed, values: Array) -> LinearRows:
+        """Linearise values (..., size) of targets; `own` is where the sensor is on a body of orientation R."""
+        kind = self.kind
+        residual = kind.residual(values, kind.predict(own, target))
+        by_sensor, by_target = kind.jacobian(own, target)
+        by_turn, by_shift = by_sensor[..., :3], by_sensor[..., 3:]
+        arm = R @ skew(self.position)
+        by_own = np.concatenate([by_turn @ self.rotation.T - by_shift @ arm, by_shift @ R], axis=-1)
+        used = np.isfinite(residual) & np.isfinite(by_own).all(axis=-1)
+        used &= np.isfinite(by_target).all(axis=-1)
+        return LinearRows(
+            np.where(used, residual, 0.0),
+            np.where(used[..., None], by_own, 0.0),
+            np.where(used[..., None], by_target, 0.0),
+            np.where(used, np.square(self.std), 1.0),
+            used,
+        )
+
+
+@cache
+def kept_kind(reference: str, options: str) -> Kind:
+    """Return `kind_of`, made once."""
+    return kind_of(reference, options)
+
+
+class Reading(NamedTuple):
+    """What one sensor has measured at a tick."""
+
+    sensor: Sensor
+    values: Array  # (m, size) in the order of the sensor's targets, NaN where nothing was measured
+    age: float = 0.0  # s since it was measured
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(m,) whether a target was measured."""
+        return np.asarray(np.isfinite(self.values).all(axis=-1))
+
+
+def landmark_place(position: Array, rotation: Array) -> Placed:
+    """Return landmarks at (..., 3) with orientations (..., 3, 3); of one that moves, that and the twist are NaN."""
+    still = np.where(np.isfinite(rotation).all(axis=-1), 0.0, np.nan)
+    return replace(Placed.at(position, rotation), velocity=still, angular_velocity=still)

@@ -1,0 +1,44 @@
+"""A user's own sensors, as the page about sensors describes them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coopenv.measurements.kinds import Placed
+
+
+class Doppler:
+    """The speed at which the distance to a target grows, m/s."""
+
+    noise = 0.05
+    units = ("m/s",)
+
+    def predict(self, own: Placed, target: Placed) -> np.ndarray:
+        line = target.position - own.position
+        return line @ (target.velocity - own.velocity) / np.linalg.norm(line)
+
+
+class NearDoppler(Doppler):
+    """A Doppler sensor of a reach of its own, m."""
+
+    def __init__(self, reach: float) -> None:
+        self.reach = reach
+
+    def sensed(self, own: Placed, target: Placed) -> bool:
+        return bool(np.linalg.norm(target.position - own.position) < self.reach)
+
+
+class Raising(Doppler):
+    """A sensor whose prediction fails behind itself."""
+
+    def predict(self, own: Placed, target: Placed) -> np.ndarray:
+        if target.position[0] > 100.0:
+            raise RuntimeError("out of order")
+        return super().predict(own, target)
+
+
+class Unknown(Doppler):
+    """A sensor whose prediction is not finite far away."""
+
+    def predict(self, own: Placed, target: Placed) -> np.ndarray:
+        return super().predict(own, target) if target.position[0] <= 100.0 else np.array([np.nan])
