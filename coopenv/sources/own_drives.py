@@ -3,7 +3,6 @@
 The worlds draw the starts and move all other vehicles. Sensors, radio and observers are as in the simulation.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Array
 from coopenv.motions.command import LATERAL, SPEED, TURN
-from coopenv.motions.own import POSE, OwnDrive
+from coopenv.motions.own import BOX, OwnDrive
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import most_boxes, own_drives
 from coopenv.sources.cosimulation import CosimulatedWorld, Moment, Poses, TrafficProgram
@@ -36,93 +35,53 @@ class OwnDrives(TrafficProgram):
         """Make the drives. Raises CoopenvError: a class cannot be loaded or fails."""
         self._drives = {i: OwnDrive(limits) for i, limits in own_drives(scenario).items()}
         self._period, self._boxes = 1.0 / scenario.rates.camera, most_boxes(scenario)
-        self._ground = -scenario.map.origin[2]
-        self._states: dict[int, Array] = {}
-        self._poses = self._placed(len(scenario.vehicles))
-
-    def _placed(self, vehicles: int) -> Poses:
-        none = np.zeros(vehicles)
-        return Poses(
-            xy=np.zeros((vehicles, 2)),
-            heading=none,
-            speed=none,
-            steering=none,
-            crashed=none,
-            left=none,
-            traffic_position=np.zeros((0, 3)),
-            traffic_heading=np.zeros(0),
-            traffic_half=np.zeros((0, 3)),
-            driven=np.full(vehicles, float(PLACED)),
-        )
+        self._vehicles, self._ground = len(scenario.vehicles), -scenario.map.origin[2]
+        self.states: dict[int, Array] = {}
+        """States of the drives by vehicle."""
 
     def reset(self, seed: int) -> None:
         """Begin an episode where the world places the vehicles."""
-        self._states.clear()
-        self._poses = self._placed(len(self._poses.heading))
+        zero = np.zeros(self._vehicles)
+        self._set(np.zeros((self._vehicles, 2)), zero, zero, zero, np.full(self._vehicles, float(PLACED)), [])
 
     def begin(self, now: Moment) -> None:
         """Start the drives at the drawn poses."""
-        self._states = {i: drive.start(pose_of(now, i)) for i, drive in self._drives.items()}
+        self.states = {i: drive.start(pose_of(now, i)) for i, drive in self._drives.items()}
         self._note(now)
 
     def command(self, now: Moment) -> None:
         """Let every drive whose vehicle is present make its step to the next tick."""
         for i, drive in self._drives.items():
-            state = self._states[i]
+            state = self.states[i]
             if np.hypot(*(now.xy[i] - state[:2])) > ELSEWHERE:
                 state = drive.start(pose_of(now, i))
             if now.present[i]:
                 state = drive.step(state, now.command[i, ENTRIES[: len(drive.columns)]], self._period)
-            self._states[i] = state
+            self.states[i] = state
         self._note(now)
 
     def _note(self, now: Moment) -> None:
-        """Note the poses, those of the other vehicles as they are."""
+        """Note the poses by the states; the other vehicles are where the world moves them."""
         xy, heading, speed = (np.array(values, float) for values in (now.xy, now.heading, now.speed))
-        turn, driven = np.zeros(len(heading)), np.ones(len(heading))
-        for i, state in self._states.items():
+        turn, driven, boxes = np.zeros(self._vehicles), np.ones(self._vehicles), []
+        for i, state in self.states.items():
             xy[i], heading[i], speed[i], driven[i] = state[:2], state[2], state[3], 0.0
             turn[i] = self._drives[i].turn(state, float(now.command[i, TURN]))
-        bodies = [self._drives[i].bodies(state) for i, state in self._states.items()]
-        boxes = np.concatenate([*bodies, np.zeros((0, 5))])
+            boxes += [*self._drives[i].bodies(state)]
         if len(boxes) > self._boxes:
             raise CoopenvError(f"dynamics.model: bodies: {len(boxes)} boxes, and {self._boxes} at the start")
-        half = np.full(len(boxes), HEIGHT / 2.0)
-        none = np.zeros(len(heading))
-        self._poses = Poses(
-            xy=xy,
-            heading=heading,
-            speed=speed,
-            steering=turn,
-            crashed=none,
-            left=none,
-            traffic_position=np.column_stack([boxes[:, :2], self._ground + half]),
-            traffic_heading=boxes[:, 2],
-            traffic_half=np.column_stack([boxes[:, 3:] / 2.0, half]),
-            driven=driven,
-        )
+        self._set(xy, heading, speed, turn, driven, boxes)
+
+    def _set(self, xy: Array, heading: Array, speed: Array, turn: Array, driven: Array, boxes: list[Array]) -> None:
+        x, y, turned, length, width = np.reshape(boxes, (-1, BOX)).T
+        half, none = np.full(len(x), HEIGHT / 2.0), np.zeros(self._vehicles)
+        place = np.column_stack([x, y, self._ground + half])
+        sides = np.column_stack([length / 2.0, width / 2.0, half])
+        self._poses = Poses(xy, heading, speed, turn, none, none, place, turned, sides, driven)
 
     def poses(self) -> Poses:
         """Return the poses after the last reset or command."""
         return self._poses
-
-    def save(self) -> Any:
-        """Return the states of the drives and the poses: data alone."""
-        return {"states": {i: state.copy() for i, state in self._states.items()}, "poses": self._poses}
-
-    def accepts(self, saved: Any) -> bool:
-        """Return whether `restore` can take this: finite states of the vehicles with drives of the user's own."""
-        states = saved.get("states") if isinstance(saved, Mapping) else None
-        if not isinstance(states, Mapping) or not isinstance(saved.get("poses"), Poses):
-            return False
-        arrays = [np.asarray(state) for state in states.values()]
-        known = {*states} <= {*self._drives}
-        return known and all(a.dtype.kind == "f" and a.ndim == 1 and len(a) >= len(POSE) for a in arrays)
-
-    def restore(self, saved: Any) -> None:
-        """Continue from a state of `save`."""
-        self._states = {i: np.array(state, float) for i, state in saved["states"].items()}
-        self._poses = saved["poses"]
 
 
 def pose_of(now: Moment, vehicle: int) -> Array:

@@ -75,7 +75,7 @@ def test_a_trailer_drives_as_its_equations_say(folder: Path) -> None:
             engine.step(levels(k)[None], 1)
             place = place + R @ engine.view("increment_translation")[0, 0]
             R = R @ engine.view("increment_rotation")[0, 0]
-    state = engine.world.programs[0].save()["states"][0]  # type: ignore[attr-defined]
+    state = engine.world.programs[0].states[0]  # type: ignore[attr-defined]
     assert_allclose(state, y, atol=0.05)
     assert abs(state[5] - state[2]) > 0.1
     assert_allclose(engine.view("position")[0, -2], [*state[:2], 0.25], atol=1e-9)
@@ -120,7 +120,7 @@ def test_a_batch_and_a_restored_state_drive_as_a_single_world(folder: Path) -> N
     assert_allclose(single.view("position"), expected[0], atol=1e-12)
     assert_allclose(single.view("traffic_rotation"), expected[1], atol=1e-12)
     with pytest.raises(CoopenvError, match="state: programs"):
-        single.set_state({**saved, "programs": [{"states": {7: np.zeros(6)}, "poses": None}]})
+        single.set_state({**saved, "programs": [{"states": {7: np.zeros(6)}}]})
     for engine in (single, batch):
         engine.close()
     envs = make_vec(towing(), num_worlds=2)
