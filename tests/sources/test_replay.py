@@ -355,7 +355,7 @@ def test_commands_and_their_rows() -> None:
         assert command.speed.tolist() == [0, 4] and command.steering.tolist() == [1, 5]
         assert command.acceleration.tolist() == [2, 6]
         pan = [0, 0] if command.pan is None else command.pan
-        assert np.array_equal(command.rows, np.column_stack([rows[:, :3], pan]))
+        assert np.array_equal(command.rows, np.column_stack([rows[:, :3], pan, np.zeros(2)]))
     assert np.array_equal(Command.of(rows).rows, rows)
 
 
