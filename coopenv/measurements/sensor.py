@@ -74,7 +74,7 @@ class Sensor:
 
     @property
     def kind(self) -> Kind:
-        """What it measures."""
+        """Kind of measurement."""
         return kept_kind(self.reference, self.options)
 
     def placed(self, R: Array, p: Array, velocity: Array, angular_velocity: Array, landmarks: Any = None) -> Placed:
@@ -115,7 +115,7 @@ def kept_kind(reference: str, options: str) -> Kind:
 
 
 class Reading(NamedTuple):
-    """What one sensor has measured at a tick."""
+    """Measurements of one sensor at a tick."""
 
     sensor: Sensor
     values: Array  # (m, size) in the order of the sensor's targets, NaN where nothing was measured

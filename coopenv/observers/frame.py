@@ -48,7 +48,7 @@ def measured_message(tick: Tick) -> Message:
 
 
 class OtherMeasurements(NamedTuple):
-    """What measurements of a frame have beside bearings; m entries, of which those of the camera are not read."""
+    """Entries of the measurements of a frame beside bearings, m of each; those of the camera are not read."""
 
     sensor: NDArray[np.int64]  # (m,) its number among the vehicle's sensors, or CAMERA
     values: Array  # (m, MOST_VALUES)
