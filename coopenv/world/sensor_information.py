@@ -6,12 +6,12 @@ import warp as wp
 
 from coopenv.measurements.in_warp import first_three, last_three
 from coopenv.measurements.kinds import MOST_ROWS, WarpFunctions
+from coopenv.measurements.sensor import COMPARED_AT
 from coopenv.world.quality import known_position
 from coopenv.world.v2x import fresh
 from coopenv.world.warp_internals import device_function
 
-COMPARED_AT = wp.constant(10.0)
-"""Distance (m) of a target whose bearing a measurement of the map is compared with."""
+COMPARED_AT_SQUARE = wp.constant(COMPARED_AT**2)
 
 
 @device_function
@@ -84,7 +84,7 @@ def inform_of(functions: WarpFunctions) -> Any:
         z = p - p
         o = p - p
         target_R = R
-        square = p.dtype(COMPARED_AT * COMPARED_AT)
+        square = p.dtype(COMPARED_AT_SQUARE)
         if own.has_target == 1:
             z = known_position(model, state, world, vehicle, target, target)
             target_R = known_rotation(model, state, world, vehicle, target)
