@@ -1,4 +1,4 @@
-"""What a kind of measurement is, and the table of kinds."""
+"""Kinds of measurements: their interface, and the table of all shipped ones."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace

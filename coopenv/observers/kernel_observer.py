@@ -47,7 +47,7 @@ def model_of(setup: Setup, p: Precision) -> Any:
     model.landmarks, model.vehicles, model.agents, model.before_boxes = L, N, T, L
     model.listed, model.kept, model.traffic, model.cells.across = 1, 0, 0, 0
     model.samples_per_tick = model.observer.blocks = model.ticks_per_decision = 1
-    model.action_size = 2
+    model.action_size = model.columns = 2
     model.horizon_ticks = 2**31 - 1
     model.odometry_period, model.odometry_rate = setup.noise.odometry_period, 1.0 / setup.noise.odometry_period
     targets = np.full((1, T), -1, dtype=np.int32)

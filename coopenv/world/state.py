@@ -194,6 +194,10 @@ ROUTE_DRAWN = Rule(
     "a number of a route, or -1",
     lambda values, fields, model: (values >= -1) & (values < max(model.routes.count.size, 1)),
 )
+TURN = Rule(
+    "a steering angle of at most 1.6 rad, or a turn rate",
+    lambda values, fields, model: np.abs(values) <= np.where(model.dynamics.numpy()["steers"] == 1, 1.6, LARGEST),
+)
 KEPT_AGENT = Rule(
     "an agent where one is kept, otherwise -1",
     lambda values, fields, model: np.where(
@@ -278,7 +282,7 @@ def _converted(name: str, values: Mapping[str, Any], like: Array) -> Array:
 @cache
 def state_struct(p: Precision) -> Any:
     """Return the Warp struct of the state in one precision."""
-    scalar, vec2, vec3, vec4, vec6 = p.scalar, p.vec2, p.vec3, p.vec4, p.vec6
+    scalar, vec2, vec3, vec5, vec6 = p.scalar, p.vec2, p.vec3, p.vec5, p.vec6
     mat33, mat66 = p.mat33, p.mat66
 
     @wp.struct
@@ -309,12 +313,13 @@ def state_struct(p: Precision) -> Any:
         position: array("WA", vec3, TRUTH)  # truth, map
         velocity: array("WA", vec3, TRUTH)  # truth, body, m/s
         angular_velocity: array("WA", vec3, TRUTH)  # truth, body, rad/s
-        speed: array("WN", scalar)  # of the bicycle, m/s
-        steering: array("WN", scalar, numbers(1.6))  # rad
+        speed: array("WN", scalar)  # forwards, m/s
+        turn: array("WN", scalar, TURN)  # steering angle, rad, or turn rate, rad/s, by the kind of motion
+        lateral_speed: array("WN", scalar)  # to the left, m/s
         pan: array("WN", scalar, numbers(3.15))  # angle by which the camera is turned to the left, rad
         action: array("WNU", scalar, numbers(1.001))  # of the current decision, in [-1, 1]
-        command: array("WN", vec4)  # target: speed m/s, steering rad, acceleration m/s^2, pan rad
-        last_command: array("WN", vec4)  # of the decision before, in force during the dead time
+        command: array("WN", vec5)  # see `coopenv.motions.command`
+        last_command: array("WN", vec5)  # of the decision before, in force during the dead time
         ended: array("WN", wp.int32, whole(-1, "last_outcome"))  # `Outcome`, then the scenario's own conditions
         collided: array("WN", wp.int32, FLAG)  # touching something now
 

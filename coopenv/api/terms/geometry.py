@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.api.terms.records import Ego, MapLandmark, Neighbour, Target, TruthRecord, log10, mat66
+from coopenv.motions.command import ACCELERATION, SPEED, TURN
 from coopenv.world.camera import (
     VISIBLE,
     behind_building,
@@ -15,7 +16,6 @@ from coopenv.world.camera import (
     project,
     segment_hits_box,
 )
-from coopenv.world.dynamics import ACCELERATION, SPEED, STEERING
 from coopenv.world.model import DRIVEN
 from coopenv.world.nearby import (
     ROUNDING,
@@ -176,15 +176,19 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     first = wp.float32(state.action[world, vehicle, 0])
     second = wp.float32(state.action[world, vehicle, 1])
     third = float(0.0)
-    if model.pans == 1:
+    if model.columns + model.pans > 2:
         third = wp.float32(state.action[world, vehicle, 2])
     ego.action = wp.vec3(first, second, third)
     ego.effort = wp.length_sq(ego.action)
     ego.bytes_sent = state.bytes_sent[world, vehicle]
     command = state.command[world, vehicle]
-    ego.command = wp.vec3(wp.float32(command[SPEED]), wp.float32(command[STEERING]), wp.float32(command[ACCELERATION]))
+    ego.command = wp.vec3(wp.float32(command[SPEED]), wp.float32(command[TURN]), wp.float32(command[ACCELERATION]))
     ego.pan = wp.float32(state.pan[world, vehicle])
-    ego.steering = wp.float32(state.steering[world, vehicle])
+    turning = wp.float32(state.turn[world, vehicle])
+    steers = model.dynamics[vehicle].steers == 1
+    ego.steering = wp.where(steers, turning, 0.0)
+    ego.turn_rate = wp.where(steers, 0.0, turning)
+    ego.lateral_speed = wp.float32(state.lateral_speed[world, vehicle])
     ego.time_left = 1.0 - wp.float32(tick) / wp.float32(model.horizon_ticks)
     if route and route_length(state, world, vehicle) > p.dtype(0.0):
         turn, left, ahead = route_from_estimate(model, state, world, vehicle, s, along)

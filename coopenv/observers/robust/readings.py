@@ -31,7 +31,7 @@ from coopenv.observers.robust.measurements import (
 from coopenv.observers.robust.memory import (
     BearingFrame,
     Derivative,
-    Reading,
+    FusedReading,
     RobustMemory,
     RobustMemoryWithReadings,
     mat26d,
@@ -174,7 +174,7 @@ def add_readings_with_sensors(
             if state.reading_tick[world, i, sensor, entry] == frame.tick:
                 memory.reading_tick[world, i, sensor] = frame.tick
                 n = own.bearings
-                memory.reading[world, i, n] = Reading()
+                memory.reading[world, i, n] = FusedReading()
                 memory.reading[world, i, n].period = own.period
                 usable = bool(True)
                 if model.sensor[sensor].has_target == 1:
