@@ -17,6 +17,8 @@ from coopenv.measurements.kinds import KINDS, Kind, Placed
 
 MAP = -1
 """Target of a kind that measures the map."""
+COMPARED_AT = 10.0
+"""Distance (m) of a target whose bearing a measurement of the map is compared with in the Gramian."""
 
 
 def kind_of(reference: str, options: str = "{}") -> Kind:
