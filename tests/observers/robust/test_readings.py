@@ -55,9 +55,9 @@ def sensor_of(kind: str, targets: Sequence[int]) -> Sensor:
     return Sensor(kind, kind, std, given, MOUNTED[1], MOUNTED[0])
 
 
-def sensing(*sensors: Sensor, P: np.ndarray) -> OpenRobust:
+def sensing(*sensors: Sensor, P: np.ndarray, rotation: np.ndarray = LANDMARK_ROTATION) -> OpenRobust:
     """Return an observer that has started at a pose with a covariance, with sensors."""
-    setup = replace(known(), sensors=sensors, landmark_rotation=LANDMARK_ROTATION)
+    setup = replace(known(), sensors=sensors, landmark_rotation=rotation)
     observer = OpenRobust(setup)
     observer.reset(AT, P)
     return observer
@@ -162,9 +162,10 @@ def test_an_outlier_is_rejected_and_counts_in_no_degree_of_freedom() -> None:
 
 def test_a_landmark_without_a_known_orientation_gives_its_place_alone() -> None:
     P, sensor = covariance(np.random.default_rng(0), 0.01, 0.04), sensor_of("relative_pose", [0])
-    observer = sensing(sensor, P=P)
+    rotation = LANDMARK_ROTATION.copy()
+    rotation[0] = np.nan
+    observer = sensing(sensor, P=P, rotation=rotation)
     values = prediction(sensor, AT, target_of(0))[None]
-    observer.state.rotation[0] = np.nan
     assert observer.update(replace(tick(observer, 1), readings=(Reading(sensor, values),))).nis_dof == 3
 
 
@@ -182,8 +183,9 @@ def test_host_and_world_estimate_the_same() -> None:
 
 def test_sensors_without_measurements_change_no_bit() -> None:
     """The kernels for sensors compute what those without compute, and worlds without sensors get the latter."""
-    silent = recorded("busy_intersection_tracking", RANGES, horizon=3.0)
-    assert all((reading.fill(np.nan) is None) for reading in silent.readings.values())
+    measured = recorded("busy_intersection_tracking", RANGES, horizon=3.0)
+    nothing = {name: np.full_like(values, np.nan) for name, values in measured.readings.items()}
+    silent = replace(measured, readings=nothing)
     plain = replace(silent, readings={}, setups=tuple(replace(setup, sensors=()) for setup in silent.setups))
     one, other = completed("robust", silent), completed("robust", plain)
     for name in ("rotation", "position", "covariance", "protection_level"):
