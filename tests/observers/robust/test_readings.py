@@ -207,11 +207,13 @@ def test_a_class_of_one_s_own_is_refused_in_one_line() -> None:
         OpenRobust(replace(known(), sensors=(own,)))
 
 
-def test_ranges_between_vehicles_halve_the_error_at_the_end_of_the_chain() -> None:
-    """f5 has .11 m at most; .04 to .07 m were seen, and .13 to .5 m without ranges."""
+def test_with_ranges_the_end_of_the_chain_is_near_its_bound() -> None:
+    """f5, who sees no landmark: .04 m were seen, and .13 to .5 m without ranges."""
     recording = recorded("busy_intersection_tracking", RANGES, 1, horizon=20.0)
-    result = completed("robust", recording)
+    result, bound = completed("robust", recording), cramer_rao_ancestors(recording)
+    late = recording.t >= 10.0
     assert result.position_rmse(10.0)[4] < 0.11
+    assert result.position_rmse(10.0).mean() < 1.3 * np.sqrt(np.mean(bound.position[late] ** 2, axis=0)).mean()
     assert (result.anees(10.0) > 0.4).all() and (result.anees(10.0) < 1.6).all()
 
 
@@ -222,9 +224,10 @@ BLIND = {
 
 
 @pytest.mark.parametrize("name", BLIND)
-def test_without_a_camera_errors_match_their_covariances_and_the_bound(name: str) -> None:
+def test_without_a_camera_errors_match_their_covariances(name: str) -> None:
     recording = recorded("busy_intersection_tracking", BLIND[name], 4, blind=True, horizon=14.0)
-    result, bound = completed("robust", recording), cramer_rao_ancestors
+    result, bound = completed("robust", recording), cramer_rao_ancestors(recording)
     late = recording.t >= 4.0
-    assert (result.anees(4.0) > 0.3).all() and (result.anees(4.0) < 2.5).all(), result.anees(4.0)
-    assert np.isfinite(result.covariance[late]).all() and bound is not None
+    assert (result.anees(4.0) > 0.3).all() and (result.anees(4.0) < 2.5).all()
+    stated = np.sqrt(np.trace(result.covariance[late][..., 3:, 3:], axis1=-2, axis2=-1)).mean(axis=0)
+    assert (stated < 1.5 * bound.position[late].mean(axis=0)).all()
