@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from coopenv.base.errors import DataError, suggest
 from coopenv.estimation.poses import Array, about_z
 from coopenv.mrclam.dataset import MAX_TRUTH_GAP_S, ROBOTS, Dataset, HeldCommands, Robot, arc, load_dataset
-from coopenv.mrclam.planar_model import ARC, CALIBRATING, IROBOT_CREATE, PATH, SLOWING, TURN, TURNING, CommandHistory
+from coopenv.measurements.sensor import MAP, Sensor
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Recording, check_recording, received_by_all
 from coopenv.observers.sensed import Truth
@@ -42,13 +42,17 @@ SPATIAL_NOISE = SensorNoise(
     bearing=0.025,
     velocity_by_speed=0.12 / math.sqrt(TICK_S),
     angular_velocity_by=(0.1 / math.sqrt(TICK_S), 0.2 / math.sqrt(TICK_S)),
+    odometry_scale=0.05,
+    turn_scale=0.25,
+    curvature=0.05,
+    turning_loss=0.6,
+    odometry_lead=0.1,
+    camera_orientation=0.02,
 )
 """Noise of odometry by the wheels' response. Tuned on the first 300 s of sub-dataset 6."""
-TRAPEZOID_S = TICK_S / 2
-"""Added to the commands' lead: observers in space take a held sample for half a period late, which it is not here."""
-ZENITH, ZENITH_PERIOD_TICKS = (0.0, 0.0, 1e6), 40
-"""m, so far above that a bearing to it depends on roll and pitch alone; and ticks from one of them to the next: few, as
-otherwise they were most of the bearings, by whose misfits an observer finds that it is lost."""
+LEAD_S, TURN_SCALE, STRAIGHT_RATE, SPEED_SCALE, LOSS = 0.2, 0.93, 0.006, 1.04, 0.5
+RANGE_STD, RANGE_STD_BY_DISTANCE = 0.1, 0.15
+FLOOR_STD, UNKNOWN_STD, FLOOR_PERIOD_TICKS = 0.01, 1e3, 20
 GAINS = (1.0, 10.0, (0.1, 1.0), (0.01, 0.01), 0.1)  # k, q, V, P0, largest turn of a sub-step
 START_STD = (0.01, 0.01)  # rad, m
 DRIFT_STD = (0.05, 0.1)  # rad and m per square root of a second without truth before the start
@@ -73,12 +77,12 @@ def recording_of(dataset: Dataset, variant: Variant, in_space: bool = False) -> 
     """
     check_variant(variant)
     subjects = [*sorted(dataset.landmarks), *ROBOTS]
-    L, N = len(dataset.landmarks) + in_space, len(ROBOTS)
+    L, N = len(dataset.landmarks), len(ROBOTS)
     T = L + N
     t = np.arange(int(dataset.duration_s / TICK_S) + 1, dtype=np.float64) * TICK_S
     K = len(t)
     column = np.zeros(max(subjects) + 1, dtype=np.int64)
-    column[subjects] = np.delete(np.arange(T), L - 1) if in_space else np.arange(T)
+    column[subjects] = np.arange(T)
     arrays: dict[str, Any] = {
         "rotation": np.broadcast_to(np.eye(3), (K, N, 3, 3)).copy(),
         **{name: np.zeros((K, N, 3)) for name in ("translation", "velocity", "angular_velocity")},
@@ -86,6 +90,10 @@ def recording_of(dataset: Dataset, variant: Variant, in_space: bool = False) -> 
         "visible": np.zeros((K, N, T), bool),
         "start_covariance": np.zeros((N, 6, 6)),
     }
+    readings = {"range": np.full((K, N, T, 1), np.nan), "level": np.full((K, N, 1, 3), np.nan), "height": np.full((K, N, 1, 3), np.nan)}
+    if in_space:
+        readings["level"][1::FLOOR_PERIOD_TICKS] = 0.0
+        readings["height"][1::FLOOR_PERIOD_TICKS] = 0.0
     pose, start = np.zeros((K, N, 3)), np.zeros((N, 3))
     for i, robot in enumerate(dataset.robots):
         held = HeldCommands(robot)
@@ -94,19 +102,16 @@ def recording_of(dataset: Dataset, variant: Variant, in_space: bool = False) -> 
         arrays["velocity"][:, i, 0], arrays["angular_velocity"][:, i, 2] = held.commands(t)
         arrays["translation"][1:, i, :2] = _turned(np.diff(reckoned[:, :2], axis=0), -reckoned[:-1, 2])
         if in_space:
-            turn, path = _response(turn, arrays["translation"][1:, i])
+            turn, path = _nominal(held, t)
             arrays["velocity"][1:, i, 0], arrays["angular_velocity"][1:, i, 2] = path / TICK_S, turn / TICK_S
             arrays["translation"][1:, i, :2] = arc(np.zeros_like(turn), path, turn)
         arrays["rotation"][1:, i] = about_z(turn)
-        k, seen, vectors = _seen(robot, variant, held, t)
+        k, seen, vectors, ranges = _seen(robot, variant, held, t)
+        readings["range"][k, i, column[seen], 0] = ranges
         arrays["bearings"][k, i, column[seen]], arrays["visible"][k, i, column[seen]] = vectors, True
         pose[:, i] = _truth(robot, held, t)
         start[i], arrays["start_covariance"][i] = _start(robot, held, pose[:, i], t)
     points = np.array([[*dataset.landmarks[subject], 0.0] for subject in sorted(dataset.landmarks)])
-    if in_space:
-        points = np.vstack([points, ZENITH])
-        arrays["bearings"][1::ZENITH_PERIOD_TICKS, :, L - 1] = (0.0, 0.0, 1.0)
-        arrays["visible"][1::ZENITH_PERIOD_TICKS, :, L - 1] = True
     arrays["landmarks"] = np.broadcast_to(points, (K, L, 3))
     arrays["start_rotation"], arrays["start_position"] = about_z(start[:, 2]), np.insert(start[:, :2], 2, 0.0, axis=1)
     recording = Recording(
@@ -118,6 +123,7 @@ def recording_of(dataset: Dataset, variant: Variant, in_space: bool = False) -> 
         staleness=math.inf,
         due=np.ones(K, bool),
         truth=Truth(about_z(pose[..., 2]), np.concatenate([pose[..., :2], 0.0 * pose[..., :1]], axis=-1)),
+        readings=readings if in_space else {},
         **arrays,
     )
     check_recording(recording, dataset.name)
@@ -125,7 +131,7 @@ def recording_of(dataset: Dataset, variant: Variant, in_space: bool = False) -> 
 
 
 def _setups(subjects: list[int], in_space: bool) -> tuple[Setup, ...]:
-    known = [f"landmark_{s}" for s in subjects] + ["zenith"] * in_space
+    known = [f"landmark_{s}" for s in subjects]
     names, landmarks = (*known, *(f"vehicle_{s}" for s in ROBOTS)), len(known)
     k, q, V, P0, max_turn = GAINS
     gains = Gains(k, np.full(len(names), q), V, P0, max_turn)
@@ -141,25 +147,32 @@ def _setups(subjects: list[int], in_space: bool) -> tuple[Setup, ...]:
             noise=SPATIAL_NOISE if in_space else NOISE,
             gains=gains,
             planar=not in_space,
+            sensors=_sensors(np.delete(np.arange(len(names)), landmarks + i)) if in_space else (),
         )
         for i, robot in enumerate(ROBOTS)
     )
 
 
-def _response(turn: Array, step: Array) -> tuple[Array, Array]:
-    """Return the turns (K,) rad and paths (K,) m of the robot by its wheels, from the commanded turns and steps.
+def _nominal(held: HeldCommands, t: Array) -> tuple[Array, Array]:
+    """Return the turns (K,) rad and paths (K,) m between ticks, from the commands by the nominal calibration."""
+    reckoned = held.pose(t - LEAD_S)
+    turn = np.diff(reckoned[:, 2])
+    step = np.diff(reckoned[:, :2], axis=0)
+    chord = step[:, 0] * np.cos(reckoned[:-1, 2] + turn / 2) + step[:, 1] * np.sin(reckoned[:-1, 2] + turn / 2)
+    path = chord / np.sinc(turn / 2 / np.pi)
+    rate = np.abs(turn) / TICK_S
+    straight = np.where(np.abs(path) > 0.0, STRAIGHT_RATE * TICK_S, 0.0)
+    return TURN_SCALE * (turn - straight), SPEED_SCALE * path * (1.0 - LOSS * rate)
 
-    The response is that of `planar_robust` before it has calibrated anything.
-    """
-    turn_scale, speed_scale, turn_offset, speed_offset, slowdown, lead, _, _, _ = CALIBRATING.mean
-    history = CommandHistory(IROBOT_CREATE, lead + TRAPEZOID_S, TICK_S)
-    path = np.copysign(np.hypot(step[:, 0], step[:, 1]), step[:, 0]) / np.sinc(turn / 2 / np.pi)
-    made = np.empty((len(turn), 7))
-    for k, commanded in enumerate(zip(turn.tolist(), path.tolist(), strict=True)):
-        history.add(TICK_S, *commanded)
-        made[k] = history.response(TICK_S, lead + TRAPEZOID_S)[0]
-    turned = turn_scale * (made[:, TURN] - turn_offset * made[:, TURNING])
-    return turned, speed_scale * made[:, PATH] + speed_offset * made[:, ARC] - slowdown * made[:, SLOWING]
+
+def _sensors(targets: NDArray[np.int64]) -> tuple[Sensor, ...]:
+    here = np.zeros(3), np.eye(3)
+    the_map = np.array([MAP])
+    return (
+        Sensor("range", "range", np.array([RANGE_STD]), targets, *here, std_by_distance=RANGE_STD_BY_DISTANCE),
+        Sensor("level", "attitude", np.array([FLOOR_STD, FLOOR_STD, UNKNOWN_STD]), the_map, *here),
+        Sensor("height", "position", np.array([UNKNOWN_STD, UNKNOWN_STD, FLOOR_STD]), the_map, *here),
+    )
 
 
 def counted(robot: Robot, variant: Variant) -> NDArray[np.bool_]:
@@ -173,15 +186,15 @@ def counted(robot: Robot, variant: Variant) -> NDArray[np.bool_]:
     return keep
 
 
-def _seen(robot: Robot, variant: Variant, held: HeldCommands, t: Array) -> tuple[NDArray[Any], NDArray[Any], Array]:
+def _seen(robot: Robot, variant: Variant, held: HeldCommands, t: Array) -> tuple[NDArray[Any], NDArray[Any], Array, Array]:
     """Return of what one robot's camera saw the ticks (n,), the subjects (n,), and unit vectors (n, 3)."""
-    time, who, _, angle = robot.detections[counted(robot, variant)].T
+    time, who, distance, angle = robot.detections[counted(robot, variant)].T
     k = np.maximum(np.searchsorted(t, time), 1)
     inside = k < len(t)
     k = k[inside]
     beta = angle[inside] - (held.pose(t[k]) - held.pose(time[inside]))[:, 2]
     vectors = np.array([(math.cos(b), math.sin(b), 0.0) for b in beta.tolist()]).reshape(-1, 3)
-    return k, who[inside].astype(np.int64), vectors
+    return k, who[inside].astype(np.int64), vectors, distance[inside]
 
 
 def _truth(robot: Robot, held: HeldCommands, t: Array) -> Array:

@@ -54,6 +54,7 @@ ZOO = {
     "split_covariance_intersection": ZooEntry("covariance_intersection:SplitCovarianceIntersection"),
     "pairwise": ZooEntry("schmidt_kalman:Pairwise"),
     "schmidt_kalman": ZooEntry("schmidt_kalman:SchmidtKalman"),
+    "self_calibrating": ZooEntry("self_calibrating:SelfCalibrating"),
     "iterated_ekf": ZooEntry("pose_filters:IteratedEkf"),
     "left_invariant": ZooEntry("pose_filters:LeftInvariant"),
     "right_invariant": ZooEntry("pose_filters:RightInvariant"),
