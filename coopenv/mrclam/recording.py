@@ -187,7 +187,9 @@ def counted(robot: Robot, variant: Variant) -> NDArray[np.bool_]:
     return keep
 
 
-def _seen(robot: Robot, variant: Variant, held: HeldCommands, t: Array) -> tuple[NDArray[Any], NDArray[Any], Array, Array]:
+def _seen(
+    robot: Robot, variant: Variant, held: HeldCommands, t: Array
+) -> tuple[NDArray[Any], NDArray[Any], Array, Array]:
     """Return of what one robot's camera saw the ticks (n,), the subjects (n,), and unit vectors (n, 3)."""
     time, who, distance, angle = robot.detections[counted(robot, variant)].T
     k = np.maximum(np.searchsorted(t, time), 1)

@@ -43,5 +43,5 @@ MRCLAM = SourceKind(
         "blind": "robots 3 to 5 see no landmark",
     },
     caveat="Friendly: robots start at their true pose; who is seen is known from barcodes, "
-    "their own left out; the nominal calibration of commands was fitted to sub-dataset 6; all receive from all, 10 Hz, no loss.",
+    "their own left out; the nominal calibration was fitted to sub-dataset 6; all receive from all, 10 Hz, no loss.",
 )

@@ -62,7 +62,8 @@ def test_an_increment_changes_with_lasting_errors_as_its_derivative_says() -> No
 
 
 def test_wheels_that_read_too_much_are_corrected() -> None:
-    lasting, tick = LastingErrors(replace(EVERY_ERROR, gyro_bias=(0.0, 0.0, 0.0), camera_orientation=0.0)), moving_tick()
+    wheels = replace(EVERY_ERROR, gyro_bias=(0.0, 0.0, 0.0), camera_orientation=0.0)
+    lasting, tick = LastingErrors(wheels), moving_tick()
     lasting.reset()
     values = np.array([0.1, 0.2, 0.0, 0.0, 0.0])  # the speed's scale, the turn's, and three more
     step = lasting.step(tick, values)
