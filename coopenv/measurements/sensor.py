@@ -73,6 +73,7 @@ class Sensor:
     position: Array  # (3,) in the body frame, m
     rotation: Array  # (3, 3) sensor to body
     options: str = "{}"  # arguments of a user's class, JSON
+    std_by_distance: float = 0.0  # of the noise beside `std`, per m to the target
 
     @property
     def kind(self) -> Kind:
@@ -101,11 +102,15 @@ class Sensor:
         by_own = np.concatenate([by_turn @ self.rotation.T - by_shift @ arm, by_shift @ R], axis=-1)
         used = np.isfinite(residual) & np.isfinite(by_own).all(axis=-1)
         used &= np.isfinite(by_target).all(axis=-1)
+        variances = np.broadcast_to(np.square(self.std), residual.shape)
+        if self.std_by_distance:
+            square = np.sum((target.position - own.position) ** 2, axis=-1)
+            variances = variances + self.std_by_distance**2 * square[..., None]
         return LinearRows(
             np.where(used, residual, 0.0),
             np.where(used[..., None], by_own, 0.0),
             np.where(used[..., None], by_target, 0.0),
-            np.where(used, np.square(self.std), 1.0),
+            np.where(used, variances, 1.0),
             used,
         )
 

@@ -48,6 +48,11 @@ class SensorNoise:
     camera_position: float = 0.0  # m per axis
     focal_length: float = 0.0  # relative
     clock_offset: float = 0.0  # s, of the vehicle's clock, by which its messages are dated
+    turn_scale: float = 0.0
+    """From here on lasting errors of odometry that is the commands of a vehicle: of the rate of turn, relative."""
+    curvature: float = 0.0  # rad/m, by which the vehicle turns while it is to drive straight
+    turning_loss: float = 0.0  # s/rad, the share of its speed that the vehicle loses per rate of turn
+    odometry_lead: float = 0.0  # s, by which odometry is ahead of the motion
     velocity_by_speed: float = 0.0  # m/s per m/s
     angular_velocity_by: tuple[float, float] = (0.0, 0.0)  # rad/s per m/s, and rad/s per rad/s
     """Additional noise of a moving vehicle's odometry samples, proportional to its motion."""

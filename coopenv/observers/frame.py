@@ -38,6 +38,7 @@ Frame = tuple[Array, Array, Array, Array, float]
 
 CAMERA = -1  # in place of the number of a sensor
 BEARING_ROWS, MOST_VALUES = 2, 6
+UNKNOWN_ANGLE = 0.5  # rad, a standard deviation from which on a sensor does not measure an angle
 
 
 def measured_message(tick: Tick) -> Message:
@@ -98,7 +99,7 @@ class LinearMeasurements(NamedTuple):
     ahead: NDArray[np.bool_]  # (m,) whether the points are ahead along the bearings, and not behind
     turn: Array | None = None  # (m, r, 3) derivative by a turn of the target about its own axes; None: it is zero
     used: NDArray[np.bool_] | None = None  # (m, r) rows that were measured; None: all
-    angles: NDArray[np.bool_] | None = None  # (m, r) rows that are angles; None: all
+    angles: NDArray[np.bool_] | None = None  # (m, r) rows that measure an angle; None: all
     common: Array | None = None  # (m, m, r, r) covariance of the residuals of two measurements of one target, or None
 
     def only(self, kept: NDArray[np.bool_]) -> "LinearMeasurements":
@@ -236,7 +237,8 @@ def linearised(pose: UncertainPose, tick: Tick, measured: UsableMeasurements) ->
     for number, kind in kinds.items():
         rows = np.flatnonzero(measured.others.sensor == number)
         _put(linear, rows, rows_of(pose, tick, measured.only(rows), number), pose, measured)
-        linear.angles[rows, : kind.rows] = [unit == "rad" for unit in kind.units]  # type: ignore[index]
+        angles = np.equal(kind.units, "rad") & (tick.readings[number].sensor.std < UNKNOWN_ANGLE)
+        linear.angles[rows, : kind.rows] = angles  # type: ignore[index]
     return linear._replace(common=_common(linear, measured))
 
 
