@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from coopenv.base.errors import check_one_of
 from coopenv.estimation.poses import Array, skew
 
 MOST_ROWS = 6  # of a kind, and numbers of its value
@@ -24,7 +25,8 @@ class Placed:
     rotation: Array  # (..., 3, 3) own axes to map
     velocity: Array  # (..., 3) map axes, m/s
     angular_velocity: Array  # (..., 3) own axes, rad/s
-    landmarks: Mapping[str, Array] = field(default_factory=dict)  # positions (3,) on the vehicle's map by name, m
+    landmarks: Mapping[str, Array] = field(default_factory=dict)
+    """Positions (3,) by name on the vehicle's map, m, of a sensor; (..., 3) if they move within a batch."""
 
     @classmethod
     def at(cls, position: Array, rotation: Array | None = None) -> "Placed":
@@ -53,11 +55,24 @@ class Placed:
     def each(self) -> Iterator["Placed"]:
         """Yield the entries of a batch."""
         shape = self.position.shape[:-1]
-        for index in np.ndindex(shape):
-            arrays: dict[str, Any] = {
-                name: np.broadcast_to(getattr(self, name), (*shape, *of))[index] for name, of in SHAPES.items()
-            }
-            yield replace(self, **arrays)
+        parts = [np.broadcast_to(getattr(self, name), (*shape, *of)).reshape(-1, *of) for name, of in SHAPES.items()]
+        moving = {
+            name: np.broadcast_to(at, (*shape, 3)).reshape(-1, 3)
+            for name, at in self.landmarks.items()
+            if np.ndim(at) > 1
+        }
+        for n, of_one in enumerate(zip(*parts, strict=True)):
+            now = Landmarks({**self.landmarks, **{name: at[n] for name, at in moving.items()}}) if moving else None
+            yield Placed(*of_one, self.landmarks if now is None else now)
+
+
+class Landmarks(dict[str, Array]):
+    """Positions of landmarks by name."""
+
+    def __missing__(self, name: str) -> Array:
+        """Refuse an unknown name. Raises CoopenvError: it names the known ones."""
+        check_one_of("own.landmarks: unknown landmark", name, self)
+        raise KeyError(name)
 
 
 SHAPES = {"position": (3,), "rotation": (3, 3), "velocity": (3,), "angular_velocity": (3,)}

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from coopenv.base.errors import check_one_of
 from coopenv.base.installation import is_reference
 from coopenv.estimation.poses import Array, skew
-from coopenv.measurements.kinds import KINDS, Kind, Placed
+from coopenv.measurements.kinds import KINDS, Kind, Landmarks, Placed
 
+NOTHING = Landmarks()
 MAP = -1
 """Target of a kind that measures the map."""
 
@@ -77,7 +78,7 @@ class Sensor:
         """What it measures."""
         return kept_kind(self.reference, self.options)
 
-    def placed(self, R: Array, p: Array, velocity: Array, angular_velocity: Array, landmarks: Any = None) -> Placed:
+    def placed(self, R: Array, p: Array, velocity: Array, angular_velocity: Array, landmarks: Any = NOTHING) -> Placed:
         """Return where it is on a body at R (..., 3, 3), p (..., 3) with a twist (..., 3) in body axes."""
         turned = R @ self.rotation
         at_sensor = velocity + np.cross(angular_velocity, self.position)
@@ -86,7 +87,7 @@ class Sensor:
             turned,
             np.asarray((R @ at_sensor[..., None])[..., 0]),
             angular_velocity @ self.rotation,
-            landmarks or {},
+            landmarks,
         )
 
     def linearised(self, R: Array, own: Placed, target: Placed, values: Array) -> LinearRows:

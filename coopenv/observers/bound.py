@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from coopenv.estimation.poses import Array, skew
-from coopenv.measurements.kinds import Placed
+from coopenv.measurements.kinds import Landmarks, Placed
 from coopenv.measurements.sensor import MAP, Sensor, landmark_place
 from coopenv.observers.recording import Recording
 
@@ -237,7 +237,8 @@ def _add_readings(
     truth, L = recording.truth, recording.landmarks.shape[1]
     values = recording.readings[sensor.name][at, i, max(target, 0)]
     R, p = truth.rotation[at, i], truth.position[at, i]
-    own = sensor.placed(R, p, recording.velocity[at, i], recording.angular_velocity[at, i])
+    marks = Landmarks(zip(recording.setups[i].target_names, np.swapaxes(recording.landmarks[at], 0, 1), strict=False))
+    own = sensor.placed(R, p, recording.velocity[at, i], recording.angular_velocity[at, i], marks)
     linear = sensor.linearised(R, own, _place_of(recording, at, target), values)
     weight = np.where(linear.used, 1.0 / linear.noise, 0.0)[..., None]
     blocks = [(slice(w * i, w * i + 6), linear.by_own)]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError
-from coopenv.measurements.kinds import MOST_ROWS, Placed
+from coopenv.measurements.kinds import MOST_ROWS, Landmarks, Placed
 from coopenv.measurements.sensor import Sensor
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import Nothing
@@ -95,7 +95,7 @@ class SensorStage:
         L, markers = self._model.landmarks, np.array(self._model.scene.marker.numpy(), float)
         R, position, velocity, turning = (np.array(getattr(self._state, name).numpy()[w], float) for name in POSES)
         points = position + (R @ markers[..., None])[..., 0]
-        marks = dict(zip(self._scenario.target_names[:L], points[:L], strict=True))
+        marks = Landmarks(zip(self._scenario.target_names[:L], points[:L], strict=True))
         at = L + i
         own = self._sensors[d].placed(R[at], position[at], velocity[at], turning[at], marks)
         if not self._kinds[d].has_target:
