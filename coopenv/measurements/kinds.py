@@ -1,6 +1,6 @@
 """What a kind of measurement is, and the table of kinds."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from coopenv.estimation.poses import Array, skew
 MOST_ROWS = 6  # of a kind, and numbers of its value
 STEP = 1e-3
 """rad and m, of differences, whose error is of the fourth order: 1e-11 for a range of 50 m."""
-WEIGHTS = {1.0: 2.0 / 3.0, 2.0: -1.0 / 12.0}  # of central differences over one and two steps
+STEPS = {1.0: 2.0 / 3.0, -1.0: -2.0 / 3.0, 2.0: -1.0 / 12.0, -2.0: 1.0 / 12.0}  # weights of values at such steps
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,10 @@ class Placed:
         return replace(self, position=self.position + error[..., 3:], rotation=turned, velocity=velocity)
 
     def repeated(self, count: int) -> "Placed":
-        """Return a batch (count,) of this one."""
+        """Return a batch (count, ...) of this one."""
+        batch = (count, *self.position.shape[:-1])
         arrays: dict[str, Any] = {
-            name: np.broadcast_to(getattr(self, name), (count, *of)) for name, of in SHAPES.items()
+            name: np.broadcast_to(getattr(self, name), (*batch, *of)) for name, of in SHAPES.items()
         }
         return replace(self, **arrays)
 
@@ -158,21 +159,18 @@ class Kind:
 
     def differences(self, own: Placed, target: Placed) -> tuple[Array, Array]:
         """Return the derivatives of `jacobian` by central differences of the fourth order."""
-        value = self.predict(own, target)
+        value, count = self.predict(own, target), 6 * len(STEPS)
+        errors = (STEP * np.array([*STEPS])[:, None, None] * np.eye(6)).reshape(
+            count, *[1] * (own.position.ndim - 1), 6
+        )
+        weights = np.array([*STEPS.values()]) / STEP
 
-        def derivative(move: Callable[[Array], tuple[Placed, Placed]]) -> Array:
-            columns = []
-            for axis in np.eye(6):
-                column: Any = 0.0
-                for steps, weight in WEIGHTS.items():
-                    error = np.broadcast_to(steps * STEP * axis, (*own.position.shape[:-1], 6))
-                    ahead, behind = (self.residual(self.predict(*move(e)), value) for e in (error, -error))
-                    column = column + (ahead - behind) * (weight / STEP)
-                columns.append(column)
-            return np.stack(columns, axis=-1)
+        def derivative(own: Placed, target: Placed) -> Array:
+            change = self.residual(self.predict(own, target), np.broadcast_to(value, (count, *value.shape)))
+            return np.einsum("s,sa...->...a", weights, change.reshape(len(STEPS), 6, *change.shape[1:]))
 
-        by_own = derivative(lambda error: (own.moved(error), target))
-        by_target = derivative(lambda error: (own, target.moved(error))) if self.has_target else np.zeros_like(by_own)
+        by_own = derivative(own.moved(errors), target.repeated(count))
+        by_target = derivative(own.repeated(count), target.moved(errors)) if self.has_target else np.zeros_like(by_own)
         return by_own, by_target
 
 

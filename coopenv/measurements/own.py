@@ -115,8 +115,6 @@ class OwnKind(Kind):
         for own, target in zip(places[::2], places[1::2], strict=True):
             value = self._numbers("predict", self._call("predict", self.own.predict, own, target))
             self.size = len(value)
-            if not np.isfinite(value).all():
-                raise CoopenvError(f"sensor '{self.reference}': predict: not finite: {shown(value.tolist())}")
             change: Any = value
             if hasattr(self.own, "residual"):
                 change = self._call("residual", self.own.residual, value, value)
@@ -129,8 +127,7 @@ class OwnKind(Kind):
             self.units = self._names("units", ("1",) * self.rows)
             if len(self.units) != self.rows:
                 raise CoopenvError(f"sensor '{self.reference}': units: {len(self.units)} for {self.rows} rows")
-            if not np.isfinite(drawn := self.sample(value, 0.1 * np.array(self.noise))).all():
-                raise CoopenvError(f"sensor '{self.reference}': sample: not finite: {shown(drawn.tolist())}")
+            self._numbers("sample", self.sample(value, 0.1 * np.array(self.noise)))
             self.sensed(own, target)
             if hasattr(self.own, "jacobian"):
                 self._compare(own, target)
@@ -156,13 +153,15 @@ class OwnKind(Kind):
         return tuple(names)
 
     def _numbers(self, name: str, value: Any) -> Array:
-        """Return 1 to 6 numbers as a vector. Raises CoopenvError: it is something else."""
+        """Return 1 to 6 finite numbers as a vector. Raises CoopenvError: it is something else."""
         try:
             array = np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError):
             array = np.empty((0, 0))
         if array.ndim > 1 or not 1 <= array.size <= MOST_ROWS:
             raise CoopenvError(f"sensor '{self.reference}': {name}: expected 1 to 6 numbers, got {shown(value)}")
+        if not np.isfinite(array).all():
+            raise CoopenvError(f"sensor '{self.reference}': {name}: not finite: {shown(value)}")
         return array.reshape(-1)
 
     def _noise(self) -> tuple[float, ...]:
