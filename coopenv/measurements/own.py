@@ -17,6 +17,10 @@ AGREEMENT = 1e-4  # of a derivative with differences, relative to its largest en
 TRIALS = 3  # places at which a kind is tried before it is used
 
 
+class SensorError(CoopenvError):
+    """A user's sensor cannot be used, or has raised something; the message names file, class and function."""
+
+
 class OwnKind(Kind):
     """A user's class as a `Kind`. It has `predict(own, target)` and `noise`, and what else it defines of a kind."""
 
@@ -33,7 +37,7 @@ class OwnKind(Kind):
         self.reference = reference
         made = load_reference(reference)
         if not (inspect.isclass(made) and callable(getattr(made, "predict", None))):
-            raise CoopenvError(f"sensor '{reference}': expected a class with predict(own, target), got {shown(made)}")
+            raise SensorError(f"sensor '{reference}': expected a class with predict(own, target), got {shown(made)}")
         self.own = self._call("its start", made, **options)
         self.has_target = bool(getattr(self.own, "has_target", True))
         self.towards = self._names("towards", Kind.towards if self.has_target else ("map",))
@@ -90,14 +94,14 @@ class OwnKind(Kind):
         return np.array(values).reshape(*own.position.shape[:-1], size)
 
     def _call(self, name: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-        """Return the result of a user's function. Raises CoopenvError: it raises something."""
+        """Return the result of a user's function. Raises SensorError: it raises something."""
         try:
             return function(*arguments, **options)
         except Exception as error:  # of any user's code
-            raise CoopenvError(f"sensor '{self.reference}': {name}: {error_text(error)}") from error
+            raise SensorError(f"sensor '{self.reference}': {name}: {error_text(error)}") from error
 
     def _checked(self, name: str, value: Any, *shape: int) -> Array:
-        """Return an array of a shape. Raises CoopenvError: it has another one, or is no array of numbers."""
+        """Return an array of a shape. Raises SensorError: it has another one, or is no array of numbers."""
         try:
             array = np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError):
@@ -105,7 +109,7 @@ class OwnKind(Kind):
         if shape[0] == 1 and array.shape == shape[1:]:  # one row may come without its axis
             array = array.reshape(shape)
         if array.shape != shape:
-            raise CoopenvError(f"sensor '{self.reference}': {name}: expected shape {shape}, got {shown(value)}")
+            raise SensorError(f"sensor '{self.reference}': {name}: expected shape {shape}, got {shown(value)}")
         return array
 
     def _try(self) -> None:
@@ -123,10 +127,10 @@ class OwnKind(Kind):
             self.needs = self._needs(own, target) if self.has_target else ()
             if self.rows != self.size and not hasattr(self.own, "sample"):
                 sizes = f"predict returns {self.size} numbers and residual {self.rows}"
-                raise CoopenvError(f"sensor '{self.reference}': sample: missing; {sizes}")
+                raise SensorError(f"sensor '{self.reference}': sample: missing; {sizes}")
             self.units = self._names("units", ("1",) * self.rows)
             if len(self.units) != self.rows:
-                raise CoopenvError(f"sensor '{self.reference}': units: {len(self.units)} for {self.rows} rows")
+                raise SensorError(f"sensor '{self.reference}': units: {len(self.units)} for {self.rows} rows")
             self._numbers("sample", self.sample(value, 0.1 * np.array(self.noise)))
             self.sensed(own, target)
             if hasattr(self.own, "jacobian"):
@@ -145,23 +149,23 @@ class OwnKind(Kind):
         return tuple(found)
 
     def _names(self, attribute: str, usual: tuple[str, ...]) -> tuple[str, ...]:
-        """Return an attribute of the class: one text, or several. Raises CoopenvError: it is something else."""
+        """Return an attribute of the class: one text, or several. Raises SensorError: it is something else."""
         given = getattr(self.own, attribute, usual)
         names = (given,) if isinstance(given, str) else given
         if not (isinstance(names, tuple | list) and all(isinstance(name, str) for name in names)):
-            raise CoopenvError(f"sensor '{self.reference}': {attribute}: expected texts, got {shown(given)}")
+            raise SensorError(f"sensor '{self.reference}': {attribute}: expected texts, got {shown(given)}")
         return tuple(names)
 
     def _numbers(self, name: str, value: Any) -> Array:
-        """Return 1 to 6 finite numbers as a vector. Raises CoopenvError: it is something else."""
+        """Return 1 to 6 finite numbers as a vector. Raises SensorError: it is something else."""
         try:
             array = np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError):
             array = np.empty((0, 0))
         if array.ndim > 1 or not 1 <= array.size <= MOST_ROWS:
-            raise CoopenvError(f"sensor '{self.reference}': {name}: expected 1 to 6 numbers, got {shown(value)}")
+            raise SensorError(f"sensor '{self.reference}': {name}: expected 1 to 6 numbers, got {shown(value)}")
         if not np.isfinite(array).all():
-            raise CoopenvError(f"sensor '{self.reference}': {name}: not finite: {shown(value)}")
+            raise SensorError(f"sensor '{self.reference}': {name}: not finite: {shown(value)}")
         return array.reshape(-1)
 
     def _noise(self) -> tuple[float, ...]:
@@ -169,11 +173,11 @@ class OwnKind(Kind):
         try:
             given = np.atleast_1d(np.asarray(stated, dtype=float))
         except (TypeError, ValueError):
-            raise CoopenvError(f"sensor '{self.reference}': noise: expected numbers, got {shown(stated)}") from None
+            raise SensorError(f"sensor '{self.reference}': noise: expected numbers, got {shown(stated)}") from None
         noise = np.broadcast_to(given, self.rows) if given.size in (1, self.rows) else np.full(1, np.nan)
         if not (noise > 0.0).all():
             expected = f"one positive number, or {self.rows} of them"
-            raise CoopenvError(f"sensor '{self.reference}': noise: expected {expected}, got {shown(given.tolist())}")
+            raise SensorError(f"sensor '{self.reference}': noise: expected {expected}, got {shown(given.tolist())}")
         return tuple(noise.tolist())
 
     def _compare(self, own: Placed, target: Placed) -> None:
@@ -182,7 +186,7 @@ class OwnKind(Kind):
             off = float(np.abs(given - right).max())
             if not off <= AGREEMENT * max(1.0, float(np.abs(right).max())):
                 row, column = np.unravel_index(np.argmax(np.abs(given - right)), right.shape)
-                raise CoopenvError(
+                raise SensorError(
                     f"sensor '{self.reference}': jacobian by {name}: entry [{row}, {column}] is "
                     f"{given[row, column]:.6g}, by differences {right[row, column]:.6g}"
                 )
