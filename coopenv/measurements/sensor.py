@@ -5,6 +5,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -109,9 +110,15 @@ class Sensor:
         )
 
 
-@cache
 def kept_kind(reference: str, options: str) -> Kind:
-    """Return `kind_of`, made once."""
+    """Return `kind_of`, made once, and again after the file of a user's class has changed."""
+    file = Path(reference.rpartition(":")[0])
+    changed = file.stat().st_mtime_ns if file.suffix == ".py" and file.exists() else 0
+    return _kept(reference, options, changed)
+
+
+@cache
+def _kept(reference: str, options: str, changed: int) -> Kind:
     return kind_of(reference, options)
 
 

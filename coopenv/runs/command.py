@@ -69,9 +69,9 @@ def execute(
 ) -> "Results":
     """Run, write to the folder `out` (None: no files), and return what came of it.
 
-    A run that does not reach its end writes nothing to `out`, unless a user's sensor ends it. `figures` is their format; None: no figures. `width` is a
-    column of `coopenv.viz.figures`; None: a page's. `describe` returns the text beside the bar. `check` is called when
-    the run is over, and raises CoopenvError if it is not worth its files.
+    A run that does not reach its end writes nothing to `out`, unless a user's sensor has ended it. `figures` is their
+    format; None: no figures. `width` is a column of `coopenv.viz.figures`; None: a page's. `describe` returns the text
+    beside the bar. `check` is called when the run is over, and raises CoopenvError if it is not worth its files.
 
     Raises:
         CoopenvError: an argument is not valid, or the results cannot be written.
@@ -90,15 +90,9 @@ def execute(
             run.engine.load()
         stride = frame_stride(scenario)
         with Progress(log, doing, run.ticks_planned, paced) as progress:
-            failure = None
-            try:
-                for tick in run.play(OF_TRAJECTORY if out is None else RECORDED):
-                    if tick % stride == 0:
-                        progress.update(tick, describe() if describe is not None else None)
-            except SensorError as error:
-                if out is None or run.ticks_recorded < 1:
-                    raise
-                failure = error
+            failure = _played(run, OF_TRAJECTORY if out is None else RECORDED, stride, progress, describe)
+            if failure is not None and (out is None or run.ticks_recorded < 1):
+                raise failure
             if check is not None and failure is None:
                 check()
             episode = run.episode(name)
@@ -127,6 +121,21 @@ def execute(
         time = run.ticks_recorded / scenario.rates.camera
         raise CoopenvError(f"{failure} (the {time:g} s before it are in {out})") from failure
     return replace(results, files=tuple(out / path.name for path in paths))
+
+
+def _played(
+    run: Rollout, fields: Sequence[str], stride: int, progress: Progress, describe: Callable[[], str] | None
+) -> CoopenvError | None:
+    """Play a run, and return the error of a user's sensor that has ended it; None: it has reached its end."""
+    try:
+        for tick in run.play(fields):
+            if tick % stride == 0:
+                progress.update(tick, describe() if describe is not None else None)
+    except CoopenvError as error:
+        if not isinstance(error, SensorError) and not isinstance(error.__cause__, SensorError):
+            raise
+        return error
+    return None
 
 
 def _figures_of(

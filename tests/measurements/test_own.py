@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from coopenv import CoopenvError
 from coopenv.measurements.kinds import Kind, Landmarks, Placed
 from coopenv.measurements.own import OwnKind, placed_at_random
-from coopenv.measurements.sensor import kind_of
+from coopenv.measurements.sensor import kept_kind, kind_of
 from tests.helpers.sessions import ROOT
 
 EXAMPLES = ROOT / "examples" / "own_sensors.py"
@@ -169,3 +170,11 @@ def test_the_derivative_of_a_range_difference_needs_the_reference_of_each_entry(
     assert_allclose(values[:, 0], expected)
     with pytest.raises(CoopenvError, match=r"own\.landmarks: unknown landmark 'mast'; known: roof"):
         kind.predict(replace(own, landmarks=Landmarks(roof=np.zeros(3))), target)
+
+
+def test_a_class_is_loaded_again_after_its_file_has_changed(tmp_path: Path) -> None:
+    reference = written(tmp_path, "noise = 0.1", RANGE)
+    assert kept_kind(reference, "{}") is kept_kind(reference, "{}")
+    written(tmp_path, "noise = 0.25", RANGE)
+    os.utime(tmp_path / "mine.py", ns=(1, 1))
+    assert kept_kind(reference, "{}").noise == (0.25,)
