@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from coopenv.estimation.poses import Array, skew
-from coopenv.measurements.kinds import Placed
+from coopenv.measurements.kinds import Landmarks, Placed
 from coopenv.measurements.sensor import COMPARED_AT, MAP, LinearRows, Sensor, landmark_place
 from coopenv.observers.recording import Recording
 
@@ -250,10 +250,11 @@ def _add_readings(
 
 
 def _linear_rows(recording: Recording, at: Any, i: int, sensor: Sensor, target: int) -> tuple[LinearRows, Array]:
-    """Return what a sensor of vehicle i has measured of a target, linearised at the truth, and distances (k,), m."""
+    """Return the measurements of a target by a sensor of vehicle i, linearised at the truth, and distances (k,), m."""
     values = recording.readings[sensor.name][at, i, max(target, 0)]
     R, p = recording.truth.rotation[at, i], recording.truth.position[at, i]
-    own = sensor.placed(R, p, recording.velocity[at, i], recording.angular_velocity[at, i])
+    marks = Landmarks(zip(recording.setups[i].target_names, np.swapaxes(recording.landmarks[at], 0, 1), strict=False))
+    own = sensor.placed(R, p, recording.velocity[at, i], recording.angular_velocity[at, i], marks)
     place = _place_of(recording, at, target)
     distance = (
         np.linalg.norm(place.position - own.position, axis=-1) if target != MAP else np.full(len(at), COMPARED_AT)

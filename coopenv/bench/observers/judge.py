@@ -208,9 +208,11 @@ def _bounds(recording: Recording) -> list[Bound]:
 def _fingerprint(recording: Recording) -> bytes:
     """Return a digest of everything that bounds depend on: truth, visibility, noise, and what is known at the start."""
     r = recording
-    setups = [(s.noise, s.landmarks, s.targets, s.marker, s.lever_arm) for s in r.setups]
+    setups = [(s.noise, s.landmarks, s.targets, s.marker, s.lever_arm, s.sensors) for s in r.setups]
     arrays = (r.truth.rotation, r.truth.position, r.visible, r.landmarks, r.due, r.start_covariance)
-    return sha256(pickle.dumps((r.dt, setups, arrays))).digest()
+    measured = {name: np.isfinite(values).all(axis=-1) for name, values in r.readings.items()}
+    twists = (r.velocity, r.angular_velocity) if r.readings else ()  # by which the bound moves sensors
+    return sha256(pickle.dumps((r.dt, setups, arrays, measured, twists))).digest()
 
 
 RELATIVE_DELTA = 1.0  # s between the poses of a pair of the relative trajectory error
