@@ -1,4 +1,4 @@
-"""Simple drivers: at constant speed, by the car ahead, waiting when lost or for the car behind, or turning to landmarks.
+"""Simple drivers: at constant speed, by cars ahead or behind, waiting when lost, or turning to landmarks.
 
 The baseline is in route_follower.py.
 """
