@@ -84,6 +84,8 @@ class Frame:
     traffic_rotation: Annotated[np.ndarray, "f K Z 3 3"]
     traffic_position: Annotated[np.ndarray, "f K Z 3"]
     traffic_half: Annotated[np.ndarray, "f K Z 3"]  # half of the edges; zero: not there
+    reading_tick: Annotated[np.ndarray | None, "i? K N D A"] = None
+    """Last ticks at which D sensors beside the camera measured targets, -1: never; None without such sensors."""
 
     @classmethod
     def of(cls, shown: FrameSource, world: int = 0) -> Self:
@@ -96,6 +98,8 @@ class Frame:
         kept: dict[str, Any] = {
             name: np.array(row[name], np.int64 if name in _WHOLE else np.float64) for name in FIELDS if name in row
         }
+        if "reading_tick" in kept and not kept["reading_tick"].size:
+            del kept["reading_tick"]
         R_hat, estimate = kept["rotation_estimate"], kept["position_estimate"]
         if "position_covariance" not in row:
             P = np.array(row["covariance"], float)
@@ -306,6 +310,8 @@ class Episode:
         arrays: dict[str, Any] = {}
         frames = [self.frame(k) for k in range(len(self))]
         for name in FIELDS:
+            if getattr(frames[0], name) is None:
+                continue
             whole = name in _WHOLE
             small = np.stack([getattr(frame, name) for frame in frames]).astype(np.int32 if whole else np.float32)
             same = np.array_equal(small[1:], small[:-1], equal_nan=not whole)
@@ -328,7 +334,7 @@ class Episode:
         count, source, scenario = header.frames, header.source, parse_scenario(header.scenario, str(path))
         n = len(scenario.vehicles)
         lengths = {"F": (count,), "K": (1, count), "N": (n,), "A": (n + len(scenario.landmarks),)}
-        lengths["R"] = (len(source.terms),)
+        lengths |= {"R": (len(source.terms),), "D": (len(scenario.sensors),)}
         stored = read_npz(path, "scene", {VIEWS.get(name, name): kinds for name, kinds in FIELDS.items()}, lengths)
         rows: dict[str, Any] = {}
         for name in FIELDS:

@@ -20,19 +20,22 @@ import warp as wp
 from coopenv.base.errors import ActionError, ScenarioError, ScenarioWarning
 from coopenv.base.seeds import world_keys
 from coopenv.estimation.linalg import block3, cholesky6, exp_so3, increment, join6, orthonormalise
+from coopenv.motions.command import command_of
+from coopenv.motions.dispatch import displacement, drive_step
+from coopenv.motions.table import DRIVES
 from coopenv.observers.riccati import accumulate_information, correct_kalman, predict_covariance, predict_pose
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets, processing_order
 from coopenv.world import launch
 from coopenv.world.camera import VISIBLE, marker_position, sight_of
-from coopenv.world.dynamics import LONGEST_SUBSTEP, bicycle_step, command_of, prescribe, yaw_rate
+from coopenv.world.dynamics import LONGEST_SUBSTEP, prescribe
 from coopenv.world.launch import kernel
 from coopenv.world.model import PRESCRIBED, precision
 from coopenv.world.nearby import sort_into_cells
 from coopenv.world.world import World
 
-scalar, vec2, vec3, vec4, mat33, mat66 = (
-    getattr(precision("float64"), name) for name in ("scalar", "vec2", "vec3", "vec4", "mat33", "mat66")
+scalar, vec3, vec5, mat33, mat66 = (
+    getattr(precision("float64"), name) for name in ("scalar", "vec3", "vec5", "mat33", "mat66")
 )
 mat23 = wp.types.matrix((2, 3), scalar)
 
@@ -44,7 +47,8 @@ class TrueMotion:
     rotation: mat33
     position: vec3
     speed: scalar
-    steering: scalar
+    turn: scalar
+    lateral: scalar
 
 
 @wp.struct
@@ -66,11 +70,16 @@ class PoseBelief:
     covariance: mat66
 
 
-def command_kernel(model: Any, action: wp.array2d(dtype=Any), command: wp.array2d(dtype=Any)):
+def command_kernel(model: Any, action: wp.array3d(dtype=Any), command: wp.array2d(dtype=Any)):
     """Make every vehicle's command of its action."""
     world, vehicle = wp.tid()
-    levels = action[world, vehicle]
-    command[world, vehicle] = command_of(model.dynamics[vehicle], levels[0], levels[1], scalar(0.0))
+    lateral = scalar(0.0)
+    if model.columns > 2:
+        lateral = action[world, vehicle, 2]
+    first = action[world, vehicle, 0]
+    command[world, vehicle] = command_of(
+        model.dynamics[vehicle], first, action[world, vehicle, 1], lateral, scalar(0.0)
+    )
 
 
 def drive_kernel(
@@ -91,10 +100,10 @@ def drive_kernel(
     world, vehicle = wp.tid()
     now = truth[world, vehicle]
     limits = model.dynamics[vehicle]
-    R, position, speed, steering = bicycle_step(
-        limits, now.rotation, now.position, now.speed, now.steering, command[world, vehicle], dt, 0
+    R, position, speed, turn, lateral = drive_step(
+        limits, now.rotation, now.position, now.speed, now.turn, now.lateral, command[world, vehicle], dt, 0
     )
-    truth_after[world, vehicle] = TrueMotion(R, position, speed, steering)
+    truth_after[world, vehicle] = TrueMotion(R, position, speed, turn, lateral)
     odometry = held[world, vehicle]
     v = odometry.velocity
     w = odometry.angular_velocity
@@ -103,8 +112,7 @@ def drive_kernel(
     else:
         rotation, translation = increment(odometry.rotation, odometry.translation, v, w, dt)
     if sample != 0:
-        v = vec3(speed, scalar(0.0), scalar(0.0))
-        w = vec3(scalar(0.0), scalar(0.0), yaw_rate(limits, speed, steering))
+        v, w = displacement(limits, speed, turn, lateral, scalar(1.0), vec3())
     held_after[world, vehicle] = Held(v, w, rotation, translation)
 
 
@@ -243,28 +251,30 @@ class DifferentiableWorld:
         self._order = processing_order(scenario, neighbour_sets(scenario))
 
     def rollout(self, actions: np.ndarray, seed: int = 0) -> DifferentiableRollout:
-        """Drive by actions (T, W, N, 2) in (-1, 1), one per decision, and differentiate the final uncertainty.
+        """Drive by actions (T, W, N, C) in (-1, 1), one per decision, and differentiate the final uncertainty.
+
+        C is the number of columns of the drive's command.
 
         Raises:
             ActionError: the actions have another shape.
         """
         world = self._world
-        expected = (world.worlds, world.model.vehicles, 2)
+        expected = (world.worlds, world.model.vehicles, world.model.columns)
         actions = np.asarray(actions)
         numeric = actions.dtype.kind in "fiu"
         if not numeric or actions.ndim != 4 or len(actions) == 0 or actions.shape[1:] != expected:
-            raise ActionError(f"actions have shape {actions.shape}, expected (decisions, W, N, 2) = (T, *{expected})")
+            raise ActionError(f"actions have shape {actions.shape}, expected (T, *{expected}), T decisions")
         if not np.isfinite(actions).all():
             raise ActionError("actions are not finite")
         if len(actions) * self.scenario.ticks_per_decision > self.scenario.horizon_ticks:
             raise ActionError(f"{len(actions)} decisions reach beyond the horizon of {self.scenario.horizon:g} s")
         world.reset(world_keys(seed, world.worlds))
-        decisions = [self._array(action, vec2) for action in actions]
+        decisions = [self._array(action, scalar) for action in actions]
         total, turn = self._array(np.zeros(1), scalar), wp.zeros(1, dtype=scalar, device=world.device)
         truth, held, belief = self._start()
         tape = wp.Tape()
         with tape:
-            commands = [self._array(np.zeros((*action.shape, 4)), vec4) for action in decisions]
+            commands = [self._array(np.zeros((*action.shape[:2], 5)), vec5) for action in decisions]
             for action, command in zip(decisions, commands, strict=True):
                 self._launch(command_kernel, [world.model, action, command])
             for tick in range(1, len(actions) * self.scenario.ticks_per_decision + 1):
@@ -306,7 +316,7 @@ class DifferentiableWorld:
         state, L = self._world.state, self._world.model.landmarks
         speed = state.speed.numpy()
         R, p = state.rotation.numpy()[:, L:], state.position.numpy()[:, L:]
-        truth = self._make(TrueMotion, rotation=R, position=p, speed=speed, steering=state.steering.numpy())
+        truth = self._make(TrueMotion, rotation=R, position=p, speed=speed, turn=state.turn.numpy())
         held = self._make(Held, velocity=speed[..., None] * np.eye(3)[0])
         R, p = state.estimate_rotation.numpy(), state.estimate_position.numpy()
         return truth, held, self._make(PoseBelief, rotation=R, position=p, covariance=state.covariance.numpy())
@@ -370,6 +380,7 @@ def check_differentiable(scenario: Scenario) -> None:
     v2x, cameras, observer = scenario.v2x, scenario.cameras, scenario.observer
     reasons = {
         "every vehicle must have the motion 'driven'": all(v.motion.kind == "driven" for v in scenario.vehicles),
+        "dynamics.model must be a kind of coopenv's": all(limits.model in DRIVES for limits in scenario.limits),
         "noise.enabled must be false": not any(noise.enabled for noise in scenario.noises),
         "v2x must have delay 0, period 1, no loss, range or staleness": (
             (v2x.delay, v2x.period, v2x.loss, v2x.range, v2x.staleness) == (0, 1, 0.0, None, None)

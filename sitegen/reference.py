@@ -95,7 +95,10 @@ def _values(field: FieldInfo) -> str:
     return ", ".join(f"{word} {value:.4g}" for word, value in found if abs(value) < 1e6)
 
 
-SCALES = {"targets": "number of targets", "steering": "angle at action 1", "pan": "angle at action 1"}
+SCALES = {
+    "targets": "number of targets",
+    **dict.fromkeys(("steering", "turn_rate", "lateral_speed", "pan"), "value at action 1"),
+}
 """Scales that are no setting of `[observation]`."""
 COLUMNS = ("field", "meaning", "unit", "scale", "center", "one per", "entries", "planar")
 

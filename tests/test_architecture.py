@@ -14,7 +14,7 @@ ROOMS = (
     ("base",),
     ("report",),
     ("estimation",),
-    ("measurements",),
+    ("measurements", "motions"),
     ("scenario",),
     ("world",),
     ("observers",),

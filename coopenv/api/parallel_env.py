@@ -62,9 +62,8 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
     Observation (per agent): a flat float32 Box whose entries `observation_layout` names, or a one-level Dict of the
     same fields. It holds only the vehicle's own measurements, received messages and estimates.
 
-    Action (per agent): Box(-1, 1, (2,), float32): speed or acceleration, and steering (positive: left); with
-    `[action.pan]` a third entry, the angle of the camera. Values beyond
-    are clipped.
+    Action (per agent): Box(-1, 1, (2,), float32): columns of its drive, such as speed or acceleration, and
+    steering (positive: left); with `[action.pan]` a further entry, the angle of the camera. Values beyond are clipped.
 
     Agents are the vehicles that actions drive. Where all motion is prescribed, every vehicle is an agent whose actions
     have no effect.

@@ -22,6 +22,7 @@ UNITS: Mapping[str, tuple[str, Mapping[str, float]]] = {
     "m/s": ("km/h or mm/s in place of m/s?", {"m/s": 1.0, "km/h": 1 / 3.6, "cm/s": 1e-2, "mm/s": 1e-3}),
     "rad/s": ("deg/s in place of rad/s?", {"rad/s": 1.0, "deg/s": DEGREE, "°/s": DEGREE, "mrad/s": 1e-3}),
     "m/s^2": ("mm/s^2 in place of m/s^2?", {"m/s^2": 1.0, "m/s²": 1.0, "mm/s^2": 1e-3, "mm/s²": 1e-3}),
+    "rad/s^2": ("deg/s^2 in place of rad/s^2?", {"rad/s^2": 1.0, "rad/s²": 1.0, "deg/s^2": DEGREE, "°/s²": DEGREE}),
     "Hz": ("a period in seconds in place of a rate in Hz?", {"Hz": 1.0, "1/s": 1.0, "kHz": 1e3}),
     "pixels": ("metres or millimetres in place of pixels?", {"pixels": 1.0, "px": 1.0}),
     "as a share": ("per cent in place of a share?", {"%": 0.01}),
@@ -93,6 +94,7 @@ SPEED = Unit("m/s", 60.0)  # prescribed motions
 DRIVEN_SPEED = Unit("m/s", 30.0)
 SPEED_ERROR = Unit("m/s", 3.0)
 TURN_RATE = Unit("rad/s", 5.0)
+TURN_ACCELERATION = Unit("rad/s^2", 100.0)
 TURN_RATE_ERROR = Unit("rad/s", 0.4)
 ACCELERATION = Unit("m/s^2", 20.0)
 FREQUENCY = Unit("Hz", 5_000.0, least=0.2)

@@ -112,6 +112,8 @@ def topics(view: LogView) -> list[View]:
     add("/scene/vehicles", fox.SceneUpdate, _vehicles, once=True)
     add("/tf", fox.FrameTransforms, _transforms)
     add("/scene/sight", fox.SceneUpdate, _sight)
+    if view.recording.readings:
+        add("/scene/readings", fox.SceneUpdate, _readings)
     if view.moving_landmarks:
         add("/scene/landmarks", fox.SceneUpdate, _moving)
     if not view.gain:
@@ -203,15 +205,37 @@ def _sight(view: LogView, k: int) -> Any:
         seen = np.flatnonzero(r.visible[k, i] & np.isfinite(eye[i]).all())
         along = eye[i] + _UNSEEN * (r.bearings[k, i] @ R[i].T)
         ends = [p for j in seen for p in (eye[i], target[j] if np.isfinite(target[j]).all() else along[j])]
-        lines = fox.LinePrimitive(
-            type=fox.LinePrimitiveLineType.LineList,
-            pose=_pose(),
-            thickness=1.5,
-            scale_invariant=True,
-            points=[_xyz(fox.Point3, end) for end in ends],
-            color=_of(i, 0.8),
-        )
-        entities.append(_entity(view, k, f"sight of {name}", lines=[lines] if ends else []))
+        entities.append(_lines(view, k, f"sight of {name}", ends, i))
+    return fox.SceneUpdate(entities=entities)
+
+
+def _lines(view: LogView, k: int, name: str, ends: list[Any], vehicle: int) -> Any:
+    """Return lines between pairs of points in the colour of a vehicle."""
+    lines = fox.LinePrimitive(
+        type=fox.LinePrimitiveLineType.LineList,
+        pose=_pose(),
+        thickness=1.5,
+        scale_invariant=True,
+        points=[_xyz(fox.Point3, end) for end in ends],
+        color=_of(vehicle, 0.8),
+    )
+    return _entity(view, k, name, lines=[lines] if ends else [])
+
+
+def _readings(view: LogView, k: int) -> Any:
+    """Return lines from sensors beside cameras to the targets measured since the tick shown before."""
+    r, R, p = view.recording, view.rotation[k], view.position[k]
+    markers = np.array([setup.marker for setup in r.setups])
+    target = np.concatenate([r.landmarks[k], p + (R @ markers[..., None])[..., 0]])
+    since, entities = max(0, k + 1 - view.ticks.step), []
+    for i, setup in enumerate(r.setups):
+        ends: list[Any] = []
+        for sensor in [sensor for sensor in setup.sensors if sensor.kind.drawn == "line" and sensor.kind.has_target]:
+            measured = np.isfinite(r.readings[sensor.name][since : k + 1, i]).all(axis=-1).any(axis=0)
+            place = p[i] + R[i] @ sensor.position
+            known = measured & np.isfinite(target).all(axis=-1) & np.isfinite(place).all()
+            ends += [end for j in np.flatnonzero(known) for end in (place, target[j])]
+        entities.append(_lines(view, k, f"readings of {setup.name}", ends, i))
     return fox.SceneUpdate(entities=entities)
 
 

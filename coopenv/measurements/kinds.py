@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,6 +110,7 @@ class Kind:
     units: tuple[str, ...]  # (rows,) of the residual
     towards: tuple[str, ...] = ("landmarks", "vehicles")  # what it measures where a scenario does not say
     needs: tuple[str, ...] = ()  # "rotation" and "velocity": what it has to know of a target beside the position
+    drawn: Literal["line", "none"] = "line"  # how pictures show a measurement: a line to its target, or not
     under_sky = False  # True: what hides the sky above it occludes it, as for a receiver of satellites
     in_warp: WarpFunctions | None = None  # None: it is computed in NumPy alone
 

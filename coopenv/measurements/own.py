@@ -37,7 +37,8 @@ class OwnKind(Kind):
         self.own = self._call("its start", made, **options)
         self.has_target = bool(getattr(made, "has_target", True))
         self.towards = tuple(getattr(made, "towards", Kind.towards if self.has_target else ("map",)))
-        self.in_warp = getattr(self.own, "in_warp", None)
+        for name in ("in_warp", "drawn", "under_sky"):
+            setattr(self, name, getattr(made, name, getattr(Kind, name)))
         self._try()
 
     def predict(self, own: Placed, target: Placed) -> Array:

@@ -102,8 +102,8 @@ class FactorGraph(PoseObserver):
 
     def collect(self, tick: Tick) -> None:
         """Add up the residuals of a frame."""
-        measured, R, p = usable_measurements(tick), self.state.R, self.state.p
-        if measured is None:
+        usable, R, p = usable_measurements(tick), self.state.R, self.state.p
+        if usable is None or not len((measured := usable.of_camera()).targets):
             return
         linear = linearised(self.state, tick, measured)
         S = linear.spread(self.state.P)

@@ -16,7 +16,8 @@ fully until most of them fit. New bearings pass the gate of the other filters fi
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
@@ -31,10 +32,10 @@ from coopenv.estimation.compiled import (
     product,
     transformed,
 )
-from coopenv.estimation.poses import Array, orthonormalise
-from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import LARGEST, PLACES, InnovationGate
-from coopenv.observers.frame import UsableMeasurements, across, linearised, measured_message, put_derivative
+from coopenv.estimation.poses import Array, orthonormalise, skew
+from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick
+from coopenv.observers.correction import LARGEST, LARGEST_OF, PLACES, InnovationGate
+from coopenv.observers.frame import CAMERA, across, linearised, measured_message, put_derivative, usable_measurements
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, moved
 
 LEAST_STD = 1e-6  # rad and m, of an odometry increment: without noise its information would be infinite
@@ -48,6 +49,15 @@ VEHICLES = types.Tuple((MATRIX, MATRIX, VECTOR, types.Array(types.boolean, 1, "A
 Bearings = tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]
 Vehicles = tuple[Array, Array, Array, NDArray[np.bool_]]
 STACK = types.Array(types.float64, 4, "A", readonly=True)
+
+
+class OtherFactors(NamedTuple):
+    """The measurements of one vehicle's sensors beside the camera at a frame."""
+
+    vehicle: int
+    tick: Tick  # without bearings
+    ticks: tuple[Tick, ...]  # of all vehicles
+    kept: NDArray[np.bool_]  # which of the usable measurements have passed the gate
 
 
 class FrameGraph:
@@ -68,6 +78,7 @@ class FrameGraph:
         self.variance = np.ones((1, N, 6))  # of it, rad^2 and m^2
         self.begin = np.zeros(2, np.int64)  # first bearing of each frame, and of the next one
         self.bearings: Bearings = np.zeros(1, np.int64), np.zeros(1, np.int64), np.zeros((1, 3)), np.zeros((1, 3))
+        self.others: dict[int, list[OtherFactors]] = {}  # of other sensors, by frame
 
     def append(self, ticks: Sequence[Tick]) -> None:
         """Add a frame without bearings, at the poses that odometry predicts."""
@@ -93,6 +104,21 @@ class FrameGraph:
             values[first:end] = new
         self.begin[self.frames] = end
 
+    def add_others(self, vehicle: int, ticks: Sequence[Tick], kept: NDArray[np.bool_]) -> None:
+        """Add the measurements (m,) of a vehicle's sensors beside the camera to the last frame, those of a mask."""
+        unseen = replace(ticks[vehicle], valid=np.zeros_like(ticks[vehicle].valid))
+        self.others.setdefault(self.frames - 1, []).append(OtherFactors(vehicle, unseen, tuple(ticks), kept))
+
+    def reports(self, frame: int, ticks: Sequence[Tick], P: Array | None = None) -> dict[int, Received]:
+        """Return what messages of all vehicles would state of a frame, by target; P (N, 6, 6): with covariances."""
+        found = {}
+        for j, (tick, marker) in enumerate(zip(ticks, self.markers, strict=True)):
+            R, p = self.R[frame, j], self.p[frame, j]
+            C = None if P is None else UncertainPose(LEFT, R, p, P[j]).marker_covariance(marker)
+            velocity = R.dot(tick.velocity + np.cross(tick.angular_velocity, marker))
+            found[self.landmarks + j] = Received(Message(p + R.dot(marker), R, C, {"velocity": velocity}), 0.0)
+        return found
+
     def move(self, first: int, dx: Array) -> None:
         """Move the poses from a frame on by their errors (F, N, 6)."""
         moved_poses(self.R[first : first + len(dx)], self.p[first : first + len(dx)], dx)
@@ -113,7 +139,45 @@ class FrameGraph:
         """
         seen = self.bearings_of(frame, frame + 1)
         information, count = pair_information(self.R[frame], self.p[frame], seen, self.vehicles)
+        for factors in self.others.get(frame, ()):
+            self.put_others(information, count, frame, factors)
         return information, count
+
+    def other_pairs(self, first: int, end: int) -> tuple[Array, Array]:
+        """Return (F, N, N, 12, 13) and (F, N, 2) what `pairs` returns of other sensors; empty without any."""
+        N = len(self.markers)
+        frames = range(first, end) if any(k in self.others for k in range(first, end)) else range(0)
+        information, count = np.zeros((len(frames), N, N, 12, 13)), np.zeros((len(frames), N, 2))
+        for n, frame in enumerate(frames):
+            for factors in self.others.get(frame, ()):
+                self.put_others(information[n], count[n], frame, factors)
+        return information, count
+
+    def put_others(self, information: Array, count: Array, frame: int, factors: "OtherFactors") -> None:
+        """Add the information of a vehicle's sensors beside the camera to the result of `pairs`."""
+        i, reports = factors.vehicle, self.reports(frame, factors.ticks)
+        measured = usable_measurements(replace(factors.tick, messages=reports), weighed=False)
+        if measured is None or not factors.kept.any():
+            return
+        measured = measured.only(factors.kept)
+        pose = UncertainPose(LEFT, self.R[frame, i], self.p[frame, i], np.zeros((6, 6)))
+        linear = linearised(pose, factors.tick, measured)
+        weight = 1.0 / np.diagonal(linear.N, axis1=1, axis2=2)
+        squared = (linear.residual**2 * weight).sum(axis=1)
+        assert linear.used is not None and linear.turn is not None
+        largest = LARGEST_OF[linear.used.sum(axis=1)]
+        count[i] += len(squared), (squared > largest).sum()
+        if self.vehicles[3][i]:
+            weight *= (np.minimum(1.0, 2.0 * largest / (largest + squared)) ** 2)[:, None]
+        for n, target in enumerate(measured.targets.tolist()):
+            j = target - self.landmarks
+            J = np.zeros((len(linear.residual[n]), 13))
+            J[:, :6], J[:, 12] = linear.H[n], linear.residual[n]
+            if j >= 0:
+                R = self.R[frame, j]
+                J[:, 6:9] = linear.turn[n] - linear.G[n].dot(R).dot(skew(self.markers[j]))
+                J[:, 9:12] = linear.G[n].dot(R)
+            information[i, j if j >= 0 else i] += J[:, :12].T.dot(weight[n][:, None] * J)
 
     def odometry(self, frame: int) -> Array:
         """Return [F u] (N, 6, 7): the error at a frame is F e + u + noise, of e (N, 6) at the frame before."""
@@ -159,29 +223,26 @@ class GraphEstimator(ABC):
         """Append a tick of every vehicle and estimate the poses."""
         self.graph.append(ticks)
         for i, tick in enumerate(ticks):
-            if tick.due and tick.valid.any():
-                self.receive(i, tick)
+            if tick.due:
+                self.receive(i, tick, ticks)
         self.P = P = self.correct(ticks)
         self.sent = self.broadcast(ticks)
         R, p = self.graph.R[self.graph.frames - 1], self.graph.p[self.graph.frames - 1]
         return [Estimate(R[i].copy(), p[i].copy(), P[i].copy()) for i in range(len(ticks))]
 
-    def receive(self, vehicle: int, tick: Tick) -> None:
-        """Add the bearings of a vehicle that pass its gate; correlations between vehicles are neglected there."""
+    def receive(self, vehicle: int, tick: Tick, ticks: Sequence[Tick]) -> None:
+        """Add the measurements of a vehicle that pass its gate; correlations between vehicles are neglected there."""
         graph, k = self.graph, self.graph.frames - 1
-        targets = tick.targets[tick.valid]
-        j, C = targets - graph.landmarks, np.zeros((len(targets), 3, 3))
-        z = np.zeros((len(targets), 3))
-        z[j < 0] = tick.landmarks[targets[j < 0]]
-        for n in np.flatnonzero(j >= 0).tolist():
-            of = UncertainPose(LEFT, graph.R[k, j[n]], graph.p[k, j[n]], self.P[j[n]])
-            z[n], C[n] = of.p + of.R.dot(graph.markers[j[n]]), of.point_covariance(graph.markers[j[n]])
-        bearings = np.asarray(tick.bearings[tick.valid], float)
-        measured = UsableMeasurements(bearings, z, C, targets, np.full(len(targets), None))
+        reported = replace(tick, messages=graph.reports(k, ticks, self.P))
+        if (measured := usable_measurements(reported)) is None:
+            return
         pose = UncertainPose(LEFT, graph.R[k, vehicle], graph.p[k, vehicle], self.P[vehicle])
         linear = linearised(pose, tick, measured)
         kept = self.gates[vehicle].passed(tick.time, linear, linear.spread(pose.P))
-        graph.add(vehicle, targets[kept], bearings[kept], z[kept])
+        bearings = measured.only(kept).of_camera()
+        graph.add(vehicle, bearings.targets, bearings.bearings, bearings.positions)
+        if measured.others is not None:
+            graph.add_others(vehicle, ticks, kept[measured.others.sensor != CAMERA])
 
     def broadcast(self, ticks: Sequence[Tick]) -> list[Message]:
         """Return the measurements of this tick, which every vehicle sends: odometry and bearings."""

@@ -16,6 +16,8 @@ import warp as wp
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array, Coordinates, left_covariance
+from coopenv.measurements.kinds import KINDS, MOST_ROWS
+from coopenv.measurements.sensor import MAP
 from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick, check_message
 from coopenv.world.embedded import Embedded, Messages
 from coopenv.world.launch import Launcher, start_warp
@@ -45,7 +47,7 @@ def model_of(setup: Setup, p: Precision) -> Any:
     model.landmarks, model.vehicles, model.agents, model.before_boxes = L, N, T, L
     model.listed, model.kept, model.traffic, model.cells.across = 1, 0, 0, 0
     model.samples_per_tick = model.observer.blocks = model.ticks_per_decision = 1
-    model.action_size = 2
+    model.action_size = model.columns = 2
     model.horizon_ticks = 2**31 - 1
     model.odometry_period, model.odometry_rate = setup.noise.odometry_period, 1.0 / setup.noise.odometry_period
     targets = np.full((1, T), -1, dtype=np.int32)
@@ -66,6 +68,7 @@ def model_of(setup: Setup, p: Precision) -> Any:
     fault.clock = known.clock_offset
     for name, entry in (("fault", fault), ("camera", camera), ("noise", noise)):
         setattr(model, name, repeated(wp.array([entry], dtype=struct_of(entry), device="cpu"), 0, N))
+    _add_sensors(model, setup, p)
     markers = np.zeros((T, 3))
     markers[L + setup.vehicle] = setup.marker
     model.scene.marker = wp.array(markers, dtype=p.vec3, device="cpu")
@@ -78,6 +81,24 @@ def model_of(setup: Setup, p: Precision) -> Any:
     model.observer.p1, model.observer.p2 = gains.P0
     model.observer.max_turn = gains.max_turn
     return model
+
+
+def _add_sensors(model: Any, setup: Setup, p: Precision) -> None:
+    """Add the sensors of a vehicle beside its camera to its model."""
+    N, T, sensors = model.vehicles, model.agents, setup.sensors
+    entries, measures = [], np.zeros((len(sensors), T), np.int32)
+    for number, sensor in enumerate(sensors):
+        kind, entry = sensor.kind, entry_struct(p, "sensor")()
+        entry.kind = [*KINDS].index(sensor.reference) if sensor.reference in KINDS else -1
+        entry.rows, entry.has_target, entry.ratio = kind.rows, int(kind.has_target), 1.0
+        entry.rotation, entry.position = p.mat33(*sensor.rotation.ravel()), p.vec3(*sensor.position)
+        entry.counted = p.vec6(*np.pad(sensor.std, (0, MOST_ROWS - kind.rows)))
+        measures[number, sensor.targets[sensor.targets != MAP]] = 1
+        entries.append(entry)
+    model.sensor = wp.array(entries, dtype=entry_struct(p, "sensor"), device="cpu")
+    model.carries = wp.full((N, len(sensors)), 1, dtype=wp.int32, device="cpu")
+    model.measures = wp.array(measures, dtype=wp.int32, device="cpu")
+    model.motion.kind = wp.zeros(T, dtype=wp.int32, device="cpu")  # the orientations of moving landmarks are NaN
 
 
 PRECISION = "float64"
@@ -128,9 +149,11 @@ class KernelObserver:
         s.estimate_rotation[...], s.estimate_position[...] = R, np.asarray(R).T @ p
         s.covariance[...] = np.diag(np.repeat(self.setup.gains.P0, 3))
         s.rotation[:L], s.rotation[L:] = np.eye(3), np.nan
+        if self.setup.landmark_rotation is not None:
+            s.rotation[:L] = self.setup.landmark_rotation
         for truth in (s.position, s.velocity, s.angular_velocity):
             truth[...] = np.nan
-        for never in (s.inbox_tick, s.inbox_stamp, s.outbox_tick, s.bearing_tick):
+        for never in (s.inbox_tick, s.inbox_stamp, s.outbox_tick, s.bearing_tick, s.reading_tick):
             never[...] = -1
         self._start_covariance[...] = initial_covariance
         self._set_clock(None, self.setup.noise.odometry_period)
@@ -177,6 +200,9 @@ class KernelObserver:
         s.sight[tick.targets] = np.where(tick.valid, _VISIBLE, _OUT_OF_VIEW)
         seen = tick.targets[tick.valid]
         s.bearing[seen], s.bearing_tick[seen] = tick.bearings[tick.valid] @ self._camera, now
+        for number, reading in enumerate(tick.readings):
+            targets, values = np.maximum(reading.sensor.targets, 0)[reading.valid], reading.values[reading.valid]
+            s.reading[number, targets, : values.shape[1]], s.reading_tick[number, targets] = values, now
 
     def _receive(self, messages: Mapping[int, Received], now: int) -> None:
         """Write the received messages; a malformed one, or one older than the start, is ignored."""

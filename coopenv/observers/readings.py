@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.base.errors import listed
+from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.base.sections import LARGEST
 from coopenv.estimation.poses import Array
+from coopenv.estimation.validity import are_numbers, are_rotations
+from coopenv.measurements.sensor import MAP
 from coopenv.observers.contract import Setup
 
 
@@ -22,6 +24,33 @@ def shapes_of_readings(setups: Sequence[Setup]) -> dict[str, tuple[int, int, int
 def nothing_measured(setups: Sequence[Setup]) -> dict[str, Array]:
     """Return the arrays of a tick at which no sensor beside the camera has measured anything."""
     return {name: np.full(shape, np.nan) for name, shape in shapes_of_readings(setups).items()}
+
+
+def problems_of_sensors(setup: Setup, first: Setup) -> Iterator[str]:
+    """Yield the errors of a vehicle's sensors beside the camera; `first` is the setup of the first vehicle."""
+    names, kinds = [sensor.name for sensor in setup.sensors], {s.name: s.reference for s in first.sensors}
+    for sensor in setup.sensors:
+        place = shown(sensor.name)
+        if not sensor.name.isidentifier():
+            yield f"{place}: is no name"
+        if names.count(sensor.name) > 1 or kinds.get(sensor.name, sensor.reference) != sensor.reference:
+            yield f"{place}: the name is used twice, or for several kinds"
+        try:
+            rows, has_target = sensor.kind.rows, sensor.kind.has_target
+        except CoopenvError as error:
+            yield f"{place}: {error}"
+            continue
+        for name, shape in (("std", (rows,)), ("position", (3,)), ("rotation", (3, 3))):
+            array = getattr(sensor, name)
+            if np.shape(array) != shape or array.dtype.kind != "f" or not are_numbers(array).all():
+                yield f"{place}.{name}: not an array of shape {shape}"
+        targets = set(sensor.targets.tolist())
+        if not (targets <= set(setup.targets.tolist()) if has_target else targets == {MAP}):
+            yield f"{place}.targets: not among the targets of {setup.name}, or not the map"
+        if not (np.asarray(sensor.std) > 0.0).all():
+            yield f"{place}.std: not positive"
+        if not are_rotations(np.asarray(sensor.rotation)).all():
+            yield f"{place}.rotation: not a rotation"
 
 
 def problems_of_readings(

@@ -12,15 +12,15 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coopenv.base.errors import CoopenvError, DataError, DataWarning, shown
+from coopenv.base.errors import DataError, DataWarning, shown
 from coopenv.base.sections import LARGEST
 from coopenv.estimation.poses import MISFIT_DEG, Array, bearing_misfit_deg, exp_so3, exp_translation
-from coopenv.estimation.validity import Mask, are_numbers, are_rotations, are_unit_vectors, everywhere
-from coopenv.measurements.sensor import MAP, Sensor
+from coopenv.estimation.validity import Mask, are_numbers, are_unit_vectors, everywhere
+from coopenv.measurements.sensor import Sensor
 from coopenv.observers.arrays import ARRAYS, invalid_rows, misshapen, recorded_names, sizes_of
 from coopenv.observers.contract import Gains, ObserverInit, Received, SensorNoise, Setup, Tick, sealed
 from coopenv.observers.faults import Interference
-from coopenv.observers.readings import problems_of_readings, shapes_of_readings
+from coopenv.observers.readings import problems_of_readings, problems_of_sensors, shapes_of_readings
 from coopenv.observers.sensed import Measurements, Sensed, Truth, is_due
 from coopenv.scenario import Scenario
 from coopenv.scenario.difficulty import MOST, PARAMETERS
@@ -370,29 +370,8 @@ def _check_setup(setup: Setup, vehicle: int, first: Setup, where: str) -> None:
     for name, count in (("q", len(setup.target_names)), ("V", 2), ("P0", 2)):
         positive = _is_array(getattr(gains, name), (count,)) and np.min(getattr(gains, name)) > 0.0
         _require(positive, f"{where}.gains.{name}: not {count} positive numbers")
-    _check_sensors(setup, first, where)
-
-
-def _check_sensors(setup: Setup, first: Setup, where: str) -> None:
-    """Check the sensors beside the camera of one vehicle."""
-    names, kinds = [sensor.name for sensor in setup.sensors], {s.name: s.reference for s in first.sensors}
-    _require(len(set(names)) == len(names), f"{where}.sensors: two have the same name")
-    for sensor in setup.sensors:
-        place = f"{where}.sensors.{shown(sensor.name)}"
-        _require(NAME.fullmatch(sensor.name), f"{place}: is no name")
-        _require(kinds.get(sensor.name, sensor.reference) == sensor.reference, f"{place}: of several kinds")
-        try:
-            rows, has_target = sensor.kind.rows, sensor.kind.has_target
-        except CoopenvError as error:
-            raise DataError(f"{place}: {error}") from None
-        positive = _is_array(sensor.std, (rows,)) and np.min(sensor.std) > 0.0
-        _require(positive, f"{place}.std: not {rows} positive numbers")
-        targets = set(sensor.targets.tolist())
-        sensible = targets <= set(setup.targets.tolist()) if has_target else targets == {MAP}
-        _require(sensible, f"{place}.targets: not among the targets of {setup.name}, or not the map")
-        _require(_is_array(sensor.position, (3,)), f"{place}.position: not three numbers")
-        turned = _is_array(sensor.rotation, (3, 3)) and bool(are_rotations(sensor.rotation))
-        _require(turned, f"{place}.rotation: not a rotation")
+    for problem in problems_of_sensors(setup, first):
+        raise DataError(f"{where}.sensors.{problem}")
 
 
 def _is_array(values: Any, shape: tuple[int, ...]) -> bool:

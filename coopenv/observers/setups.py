@@ -8,7 +8,7 @@ import numpy as np
 
 from coopenv.estimation import UNIFORM_ROTATION
 from coopenv.estimation.poses import Array, about_z
-from coopenv.measurements.sensor import MAP, Sensor, averaged_std
+from coopenv.measurements.sensor import MAP, Sensor
 from coopenv.observers.contract import MIN_BEARING_STD, Gains, ObserverInit, SensorNoise, Setup
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets
@@ -61,9 +61,7 @@ def sensors_of(scenario: Scenario, vehicle: int, neighbours: Sequence[int]) -> t
     for section in scenario.sensors:
         if not section.is_on(scenario.vehicle_names[vehicle]):
             continue
-        kind, correlated = section.made, section.correlated
-        period = 1.0 / min(section.rate or math.inf, scenario.rates.camera)
-        std = averaged_std(section.white, correlated.std, correlated.time, period)
+        kind, std = section.made, section.counted(scenario.rates.camera)
         found = [j for j in neighbours if section.measures(scenario, int(j))]
         sensors.append(
             Sensor(

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 from scipy.linalg import cholesky_banded, solve_triangular
 from scipy.linalg.lapack import dtbtrs
@@ -37,6 +38,7 @@ from coopenv.observers.frame_graph import (
 )
 from coopenv.observers.uncertain_pose import LEFT, recentring
 
+OTHERS = types.Array(types.float64, 5, "A", readonly=True)
 LAG = 0.5  # s that are linearised anew
 STEP_PERIOD = 0.1  # s between steps over the lag
 GROWTH = 1.25  # of the number of frames, until the whole window is linearised anew
@@ -134,6 +136,7 @@ class FixedLagSmoother(GraphEstimator):
         g, first, end = self.graph, prior.frame, self.graph.frames if last is None else last + 1
         arguments: list[Any] = [getattr(g, name)[first:end] for name in g.FRAME_ARRAYS]
         arguments += [g.begin[first : end + 1] - g.begin[first + 1], g.bearings_of(first + 1, end), g.vehicles]
+        arguments += g.other_pairs(first, end)
         bands, eta, seen = normal_equations(*arguments)
         size = 6 * len(g.markers)
         rows, columns = np.tril_indices(size)
@@ -173,7 +176,7 @@ def add_block(bands: Array, row: int, column: int, block: Array) -> None:
                 bands[row + r - column - c, column + c] += block[r, c]
 
 
-@compiled(STACK, MATRICES, STACK, MATRICES, MATRICES, PLACES, SEEN, VEHICLES)
+@compiled(STACK, MATRICES, STACK, MATRICES, MATRICES, PLACES, SEEN, VEHICLES, OTHERS, MATRICES)
 def normal_equations(
     R: Array,
     p: Array,
@@ -183,10 +186,13 @@ def normal_equations(
     begin: NDArray[np.int64],
     bearings: Bearings,
     vehicles: Vehicles,
+    others: Array,
+    other_count: Array,
 ) -> tuple[Array, Array, Array]:
     """Return the information (12N, 6NF) of F frames in lower banded form, information times error, and the counts.
 
-    The bearings of the first frame are not in it, nor is any prior. Arguments are the arrays of `FrameGraph`.
+    The measurements of the first frame are not in it, nor is any prior. Arguments are the arrays of `FrameGraph` and
+    the results of `other_pairs`.
     """
     F, N = len(R), len(R[0])
     size = 6 * N
@@ -209,10 +215,12 @@ def normal_equations(
         of = slice(begin[k], begin[k + 1])
         observer, target, bearing, point = bearings
         L, seen = pair_information(R[k], p[k], (observer[of], target[of], bearing[of], point[of]), vehicles)
+        if len(others):
+            L, seen = L + others[k], seen + other_count[k]
         count += seen
         for i in range(N):
             for j in range(N):
-                if L[i, j, 0, 0] + L[i, j, 1, 1] + L[i, j, 3, 3] + L[i, j, 4, 4] + L[i, j, 5, 5] > 0.0:
+                if L[i, j, 0, 0] + L[i, j, 1, 1] + L[i, j, 2, 2] + L[i, j, 3, 3] + L[i, j, 4, 4] + L[i, j, 5, 5] > 0.0:
                     a, b = size * k + 6 * i, size * k + 6 * j
                     add_block(bands, a, a, L[i, j, :6, :6])
                     eta[a : a + 6] += L[i, j, :6, 12]

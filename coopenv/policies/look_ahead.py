@@ -118,7 +118,10 @@ class LookAhead(RouteFollower):
         self._top = np.array([limits.max_speed for limits in scenario.limits])
         self._views = [FieldOfView(camera) for camera in scenario.cameras]
         self._one_view = all(vars(view) == vars(self.view) for view in self._views)
-        self._sharpest = np.tan(self.layout.action[1].high) / self.wheelbase  # rad/m
+        turns = [fields[1] for fields in self.layout.actions]
+        self._sharpest = min(  # rad/m
+            turn.high / self.cruise if turn.unit == "rad/s" else np.tan(turn.high) / self.wheelbase for turn in turns
+        )
 
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
         """See `Driver.drive`."""
@@ -128,15 +131,15 @@ class LookAhead(RouteFollower):
         plan[due] = self.planned(observations, due)
         left[due] = HOLD
         left -= 1
-        steering, points = self.path(observations, plan, blocked)
-        return np.minimum(self.speed(observations, points), self._pace[plan] * self.cruise), steering
+        turn, points = self.path(observations, plan, blocked)
+        return np.minimum(self.speed(observations, points), self._pace[plan] * self.cruise), turn
 
     def rule(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what a learned policy has to keep to: (rows,) each.
 
         Returns:
             flags of rows that drive by a plan, because something stands in the way or they are so far off the route
-            that plans lead back; speeds, m/s, which give way; steering angles of the plans, rad.
+            that plans lead back; speeds, m/s, which give way; turns of the plans, see `Driver.pursue`.
         """
         blocked, plan = self.blocked(observations), np.zeros(len(observations), dtype=int)
         plans = blocked | (np.abs(self.read(observations, "route_offset")[:, 0]) > self.farthest)
@@ -159,7 +162,7 @@ class LookAhead(RouteFollower):
         return np.asarray(plan[np.sort(due)])
 
     def path(self, observations: np.ndarray, plan: np.ndarray, blocked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the steering, (rows,) in rad, and the path, (rows, P, 2) in m: the plan's first leg if blocked."""
+        """Return the turn, see `Driver.pursue`, and the path, (rows, P, 2) in m: the plan's first leg if blocked."""
         points, distance = self.route_points(observations)
         offset, along = self._first[plan], self.pursue(self.direction(observations))
         aside = offset - self.read(observations, "route_heading")[:, 0]

@@ -64,9 +64,9 @@ class RightOfWay:
     def __call__(self, observations: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """Return actions (rows, A) by the rule; rows are those of all vehicles."""
         (plans, *wanted), found = self._driver.rule(observations), np.array(actions)
-        speed, steering = (f.level(w) for f, w in zip(self._driver.layout.action, wanted, strict=False))
+        speed, turn = self._driver.levels(*wanted).T[:2]
         found[:, 0] = np.where(plans, speed, np.minimum(found[:, 0], speed))
-        found[:, 1] = np.where(plans, np.clip(steering, -1.0, 1.0), found[:, 1])
+        found[:, 1] = np.where(plans, turn, found[:, 1])
         return found
 
 

@@ -225,8 +225,9 @@ class FieldOfView:
     """The horizontal field of view of a camera that looks ahead."""
 
     def __init__(self, camera: Camera) -> None:
-        """Take a camera; a camera without an image has a field of view of 360 degrees."""
+        """Take a camera; one without an image has a field of view of 360 degrees, the model "none" sees nothing."""
         self.reach = SHARE * camera.range if camera.range is not None else math.inf
+        self.reach = -1.0 if camera.model == "none" else self.reach
         self.ahead = float(camera.position[0])
         self.left, self.right = math.pi, -math.pi
         if camera.model == "pinhole":

@@ -16,12 +16,15 @@ MULTIPLES = np.array([1.0, 2.0, 4.0, 8.0])
 SMALL = (0.586, 0.25)
 """Length and width, m, of the car that distances are chosen for (SVEA); they grow with larger ones."""
 
+LEAST_CURVATURE = 1e-6
+"""1/m; a smaller one counts as straight on."""
+
 PURSUED = 5.0
 """Decisions, at least, until a vehicle reaches the pursued point, so that it steers before it is past it."""
 
 
 class Driver(ABC):
-    """A policy that chooses speed and steering for every row from its observation alone."""
+    """A policy that chooses speed and steering, or turn rate, for every row from its observation alone."""
 
     needs: tuple[str, ...] = ()
     """Fields of the observation without which it cannot drive."""
@@ -36,11 +39,19 @@ class Driver(ABC):
             cruise: speed when nothing is in the way, m/s; also what others are expected to drive (None: top speed).
 
         Raises:
-            ValueError: the observation lacks a field, or the environment does not take speeds.
+            ValueError: the observation lacks a field, or the environment does not take speeds and steering.
         """
         if scenario.action.longitudinal != "speed":
             raise ValueError("it chooses speeds, so it needs action.longitudinal = 'speed'")
         self.layout = observation_layout(scenario)
+        for speed, turn, *_ in self.layout.actions:
+            if speed.unit != "m/s" or turn.unit not in ("rad", "rad/s"):
+                units = f"{speed.name} in {speed.unit} and {turn.name} in {turn.unit}"
+                raise ValueError(
+                    f"it chooses a speed (m/s) and a steering angle (rad) or turn rate (rad/s), not {units}"
+                )
+        self._by_rate = np.array([turn.unit == "rad/s" for _, turn, *_ in self.layout.actions])
+        """(N,), which vehicles turn by a rate, not by an angle."""
         self.agents = scenario.target_names[len(scenario.landmarks) :]
         """Names of the vehicles in the order of rows."""
         known = {*self.layout, "route" if {"route_ahead", "goal"} & {*self.layout} else ""}
@@ -71,16 +82,42 @@ class Driver(ABC):
 
     @abstractmethod
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return speed, m/s, steering angle, rad (positive to the left), and maybe the camera's pan, (rows,) each."""
+        """Return speed, m/s, turn (see `pursue`), and maybe the camera's pan, rad to the left, (rows,) each."""
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return the actions, (rows, A), for observations (rows, D)."""
-        actions = np.zeros((len(observations), len(self.layout.action)), dtype=np.float32)
-        wanted = self.drive(np.asarray(observations, dtype=np.float32))
-        for k, (field, values) in enumerate(zip(self.layout.action, wanted, strict=False)):
-            actions[:, k] = np.clip(field.level(values), -1.0, 1.0)
+        actions = self.levels(*self.drive(np.asarray(observations, dtype=np.float32)))
         actions[:, [field.name.startswith(RADIO) for field in self.layout.action]] = 1.0  # it sends whole reports
         return actions
+
+    def levels(self, speed: np.ndarray, turn: np.ndarray, pan: np.ndarray | None = None) -> np.ndarray:
+        """Return the actions, (rows, A), for what `drive` has returned; other entries are 0.
+
+        A vehicle that cannot turn so fast drives more slowly, along the same circle.
+        """
+        actions = np.zeros((len(speed), len(self.layout.action)), dtype=np.float32)
+        by_rate = self._in_rows(self._by_rate, len(speed))
+        for rate in (False, True):
+            rows = by_rate == rate
+            if not rows.any():
+                continue
+            fields = self.layout.actions[int(np.argmax(self._by_rate == rate))]
+            wanted = [speed[rows], turn[rows]]
+            if rate:
+                curvature = wanted[1] / self.cruise
+                wanted[0] = np.minimum(wanted[0], fields[1].high / np.maximum(np.abs(curvature), LEAST_CURVATURE))
+                wanted[1] = curvature * wanted[0]
+            for k, values in enumerate(wanted):
+                actions[rows, k] = np.clip(fields[k].level(values), -1.0, 1.0)
+        if pan is not None:
+            place = next(k for k, field in enumerate(self.layout.action) if field.name == "pan")
+            actions[:, place] = np.clip(self.layout.action[place].level(pan), -1.0, 1.0)
+        return actions
+
+    def _in_rows(self, of_vehicles: np.ndarray, rows: int) -> np.ndarray:
+        """Return a property of the vehicles, (N,), by rows; where they are not of all vehicles, the first one's."""
+        vehicles = len(of_vehicles)
+        return np.resize(of_vehicles, rows) if rows % vehicles == 0 else np.full(rows, of_vehicles[0])
 
     def read(self, observations: np.ndarray, name: str) -> np.ndarray:
         """Return a field of the observations in its unit, (rows, *shape)."""
@@ -115,14 +152,20 @@ class Driver(ABC):
         return np.asarray(np.arctan2(point[:, 1], point[:, 0]))
 
     def pursue(self, direction: np.ndarray) -> np.ndarray:
-        """Return the steering angles, (rows,), that lead along a circle to a point `look_ahead` away, all in rad.
+        """Return what leads along a circle to a point `look_ahead` away in a direction, (rows,), rad.
+
+        That is the steering angle (rad), or of a drive without steering the turn rate (rad/s) at the speed `cruise`.
 
         Source: Coulter, Implementation of the Pure Pursuit Path Tracking Algorithm, 1992. What lies behind counts as
         beside.
         """
         turn = np.clip((direction + np.pi) % (2.0 * np.pi) - np.pi, -np.pi / 2.0, np.pi / 2.0)
         circle = self.look_ahead + (self.wheelbase * np.cos(turn) if self.midway else 0.0)
-        return np.asarray(np.arctan(2.0 * self.wheelbase * np.sin(turn) / circle))
+        steering = np.arctan(2.0 * self.wheelbase * np.sin(turn) / circle)
+        if not self._by_rate.any():
+            return np.asarray(steering)
+        rate = self.cruise * 2.0 * np.sin(turn) / circle
+        return np.asarray(np.where(self._in_rows(self._by_rate, len(turn)), rate, steering))
 
 
 GAP = 0.25

@@ -45,8 +45,14 @@ class SetDriver(LookAhead):
     remembers = 0
 
     def __init__(self, scenario: Scenario, weights: Mapping[str, np.ndarray]) -> None:
-        """Build it for a scenario; without weights it gives inputs only."""
+        """Build it for a scenario; without weights it gives inputs only.
+
+        Raises:
+            ValueError: as for `Driver`, or a vehicle does not steer.
+        """
         super().__init__(scenario)
+        if self._by_rate.any():
+            raise ValueError("its network chooses steering angles: dynamics.model must be 'bicycle'")
         self._weights = weights
         count = len(self._top)
         columns: list[np.ndarray | list[float]] = [

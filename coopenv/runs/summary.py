@@ -23,6 +23,7 @@ from coopenv.runs.scenario_text import settings, text_table
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.scenes import scene_rows
 from coopenv.scenario.sensing import Noise
+from coopenv.scenario.sensors import SensorSection
 from coopenv.sources.registry import ENVIRONMENT, LOG, kinds
 
 DESCRIPTION_LENGTH = 240  # characters of a scenario's description on the first screen
@@ -66,6 +67,8 @@ def facts(scenario: Scenario) -> dict[str, str]:
         "Observation": f"{groups.total()} numbers per vehicle: "
         + ", ".join(f"{group} {size}" for group, size in groups.items() if size),
     }
+    if scenario.sensors:
+        found["Sensors"] = "; ".join(_sensor(scenario, section) for section in scenario.sensors)
     if scenario.driven:
         spans = [f"{entry.name} {number(entry.low)} to {number(entry.high)} {entry.unit}" for entry in layout.action]
         found["Action"] = f"{len(spans)} numbers in [-1, 1]: {', '.join(spans)}{_own(scenario, 'dynamics')}"
@@ -127,6 +130,8 @@ def _targets(scenario: Scenario) -> str:
 
 def _camera(scenario: Scenario) -> str:
     camera, noise, noisy = scenario.camera, scenario.noise.bearing, scenario.noise.enabled
+    if camera.model == "none":
+        return "none"
     unit = "rad" if noise.model == "isotropic" else "on the image plane"
     off = _joined(
         " and ",
@@ -142,6 +147,21 @@ def _camera(scenario: Scenario) -> str:
     )
     spread = f"{noise.model} noise {number(noise.scale)} {unit}" if noisy else "no noise"
     return f"{seen}; bearings, {spread}" + (f"; mounted off by {off} per axis" if off and noisy else "")
+
+
+def _sensor(scenario: Scenario, section: SensorSection) -> str:
+    """Return a sensor beside the camera in words."""
+    kind, own = section.made, [name for name in scenario.vehicle_names if section.is_on(name)]
+    stds = dict.fromkeys(f"{number(std)} {unit}" for std, unit in zip(section.white, kind.units, strict=True))
+    return _joined(
+        ", ",
+        section.label if section.label == section.kind else f"{section.label} ({section.kind})",
+        f"towards {' and '.join(kind.towards if section.towards is None else section.towards)}",
+        section.rate and f"{number(section.rate)} Hz",
+        section.range is not None and f"up to {number(section.range)} m",
+        len(own) < len(scenario.vehicles) and f"on {listed(own)}",
+        f"noise {' and '.join(stds)}" if scenario.noise.enabled else "no noise",
+    )
 
 
 def _lasting(noise: Noise) -> str:

@@ -124,7 +124,7 @@ class WaypointMotion(Section):
 
 
 class DrivenMotion(Section):
-    """Driven by the agent's actions through the kinematic bicycle of `[dynamics]`."""
+    """Driven by the agent's actions through the drive of `[dynamics]`."""
 
     kind: Literal["driven"] = "driven"
     driver: Annotated[str, Field(min_length=1, max_length=1_000)] | None = None

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from coopenv.base import installation
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.sections import one_line
+from coopenv.motions.table import DRIVES
 from coopenv.scenario.cosimulators import COSIMULATORS, FILES
 from coopenv.scenario.terms import (
     GROUPS,
@@ -161,6 +162,22 @@ def located(
         part = result.get(section)
         if isinstance(part, dict):
             result[section] = {k: _placed(v, folder, place) if k in keys else v for k, v in part.items()}
+    return _with_models(result, lambda model: place(model, folder))
+
+
+def _with_models(raw: dict[str, Any], change: Callable[[str], str]) -> dict[str, Any]:
+    """Return a scenario with the places of users' own drives changed, those of single vehicles included."""
+
+    def changed(part: Any) -> Any:
+        drive = part.get("dynamics") if isinstance(part, dict) else None
+        if not isinstance(drive, dict) or not isinstance(drive.get("model"), str):
+            return part
+        own = installation.is_reference(drive["model"])
+        return {**part, "dynamics": {**drive, "model": change(drive["model"])}} if own else part
+
+    result: dict[str, Any] = changed(raw)
+    if isinstance(vehicles := raw.get("vehicles"), list | tuple):
+        result = {**result, "vehicles": [changed(vehicle) for vehicle in vehicles]}
     return result
 
 
@@ -202,4 +219,4 @@ def without_own_terms(raw: Mapping[str, Any]) -> dict[str, Any]:
         if section == "termination":
             known = (*kind.built_in, "after_arrival")
             result[section] = {key: on for key, on in part.items() if key in known}
-    return result
+    return _with_models(result, lambda model: DRIVES[0])

@@ -15,6 +15,7 @@ from coopenv.base.errors import ScenarioError, ScenarioWarning, check_one_of, li
 from coopenv.base.installation import load_reference
 from coopenv.base.sections import Positive, Section, Text, Vector3, overlaid, validated
 from coopenv.base.units import EPISODE, PLACE, TIME, warn_of_implausible
+from coopenv.motions.table import DRIVES, columns_of, further_bodies
 from coopenv.report.notebook import facts_html, one_line, picture_html
 from coopenv.scenario.bodies import MOST_LANDMARKS, Landmark, LandmarkGroup, Obstacle, Road, Vehicle
 from coopenv.scenario.cosimulators import COSIMULATORS, Cosimulator, Highway, Program, Sumo
@@ -199,10 +200,16 @@ class Scenario(Section, metaclass=_Loaded):
         return [i for i in free if self.acting[i]] or free
 
     @property
+    def columns(self) -> int:
+        """Number of the first entries of an action, which drive: columns of the command of the vehicle with most."""
+        drives = {limits.model: limits for limits in self.limits}
+        return max(len(columns_of(limits)) for limits in drives.values())
+
+    @property
     def action_size(self) -> int:
         """Number of entries of an action."""
         radio = len(self.vehicles) - 1 if self.action.radio else 0
-        return (2 if self.action.pan is None else 3) + radio
+        return self.columns + (self.action.pan is not None) + radio
 
     @property
     def has_lasting_errors(self) -> bool:
@@ -403,7 +410,7 @@ def _problems_of_driving(s: Scenario) -> Iterator[str]:
         yield "action.radio: no vehicle receives messages of another one here (v2x.links, vehicles.*.neighbours)"
     if s.reward.own_share and s.reward.team == "own":
         yield "reward.own_share: only with reward.team = 'mean' or 'min'"
-    steering, decision = s.action.steering, 1.0 / s.rates.decision
+    decision = 1.0 / s.rates.decision
     for i, (vehicle, limits) in enumerate(zip(s.vehicles, s.limits, strict=True)):
         own = vehicle.dynamics is not None
         where, top = f"vehicles.{i}.dynamics" if own else "dynamics", limits.max_speed
@@ -412,8 +419,19 @@ def _problems_of_driving(s: Scenario) -> Iterator[str]:
             yield f"vehicles.{i}.motion.initial_speed: {speed:g} m/s is beyond what [dynamics] permits"
         if limits.latency > decision:
             yield f"{where}.latency: {limits.latency:g} s is longer than one decision ({decision:g} s)"
-        if steering is not None and steering > limits.max_steering:
-            yield f"action.steering: {steering:g} rad is above {where}.max_steering ({limits.max_steering:g} rad)"
+        yield from (f"{where}.{problem}" for problem in _problems_of_drive(s, vehicle, limits))
+        for column in columns_of(limits) if limits.model in DRIVES else ():
+            if (wanted := s.action.at_one(column)) > column.high:
+                above = f"{wanted:g} {column.unit} is above {where}.{column.limit} ({column.high:g} {column.unit})"
+                yield f"action.{column.name}: {above}"
+
+
+def _problems_of_drive(s: Scenario, vehicle: Vehicle, limits: Dynamics) -> Iterator[str]:
+    """Yield the conflicts of a vehicle's kind of motion with the simulator that moves it."""
+    if vehicle.motion.kind == "traffic" and s.cosimulator is None and limits.model != DRIVES[0]:
+        yield f"model: {shown(limits.model)}: the model of traffic drives vehicles of the model '{DRIVES[0]}'"
+    if limits.model not in DRIVES and (s.cosimulator is not None or s.sensing == "images"):
+        yield f"model: {shown(limits.model)}: the user's own drive needs backend = 'simulated' without rendered frames"
 
 
 def _receives(s: Scenario) -> bool:
@@ -486,6 +504,19 @@ def _doubts(s: Scenario, neighbours: Sequence[Sequence[int]]) -> Iterator[str]:
                 "the scene"
             )
             break
+
+
+def own_drives(scenario: Scenario) -> dict[int, Dynamics]:
+    """Return the dynamics of the vehicles that a drive of the user's own moves, by their indices."""
+    pairs = enumerate(zip(scenario.vehicles, scenario.limits, strict=True))
+    return {i: own for i, (vehicle, own) in pairs if vehicle.motion.kind == "driven" and own.model not in DRIVES}
+
+
+def most_boxes(scenario: Scenario) -> int:
+    """Return the largest number of moving boxes besides agents: a co-simulator's traffic, or bodies of own drives."""
+    if scenario.cosimulator is not None:
+        return scenario.cosimulator.most_vehicles
+    return sum(further_bodies(limits) for limits in own_drives(scenario).values())
 
 
 def agent_starts(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:

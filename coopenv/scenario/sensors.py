@@ -1,8 +1,9 @@
 """Sensors beside the camera: what each one measures, on which vehicles, towards what, and how well."""
 
 import json
+import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -13,14 +14,11 @@ from coopenv.base.installation import check_reference, is_reference
 from coopenv.base.sections import NonNegative, Positive, QuaternionWxyz, Rate, Section, Vector3
 from coopenv.estimation.poses import Array
 from coopenv.measurements.kinds import KINDS, Kind
-from coopenv.measurements.sensor import kept_kind
+from coopenv.measurements.sensor import averaged_std, kept_kind
 from coopenv.scenario.sensing import rotation_of
 
-if TYPE_CHECKING:
-    from coopenv.scenario.schema import Scenario
-
 GROUPS = ("landmarks", "vehicles", "anchors", "map")
-"""What a sensor may measure, beside single landmarks and vehicles by name."""
+"""Targets of a sensor, beside single landmarks and vehicles by name."""
 MOST_SENSORS = 16
 
 
@@ -60,7 +58,7 @@ class SensorSection(Section):
     vehicles: tuple[str, ...] | None = None
     """Names of the vehicles that have it (default: all)."""
     towards: tuple[str, ...] | None = None
-    """What it measures: `landmarks`, `vehicles`, `anchors` (landmarks for radios, which cameras do not see), `map`, and
+    """Its targets: `landmarks`, `vehicles`, `anchors` (landmarks for radios, which cameras do not see), `map`, and
     names of landmarks, groups and vehicles (default: the kind's own)."""
     rate: Annotated[Rate | None, units.FREQUENCY] = None
     """Measurements per second, at the nearest camera ticks (none: at every tick)."""
@@ -75,7 +73,7 @@ class SensorSection(Section):
     field_of_view: Annotated[Positive | None, units.HEADING] = None
     """Full angle of the cone about the sensor's x axis in which targets lie, rad (none: every direction)."""
     occluded: bool = True
-    """Whether buildings and bodies between it and a target hide the target."""
+    """Whether buildings and bodies hide a target behind them, and buildings above a receiver of `position` the sky."""
     miss_probability: units.Chance = 0.0
     """Chance that a measurement is lost, drawn per target and measurement."""
     bias: NonNegative = 0.0
@@ -105,6 +103,11 @@ class SensorSection(Section):
             raise CoopenvError(f"sensors.{self.label}.noise: {len(given)} numbers for {rows} rows")
         return np.broadcast_to(given, rows)
 
+    def counted(self, camera: float) -> Array:
+        """Return standard deviations (rows,) by which filters count its noise; `camera` is the rate of ticks, Hz."""
+        period = 1.0 / min(self.rate or math.inf, camera)
+        return averaged_std(self.white, self.correlated.std, self.correlated.time, period)
+
     @property
     def mounting(self) -> Array:
         """(3, 3) sensor to body."""
@@ -114,7 +117,7 @@ class SensorSection(Section):
         """Return whether a vehicle of a name has it."""
         return self.vehicles is None or vehicle in self.vehicles
 
-    def measures(self, scenario: "Scenario", target: int) -> bool:
+    def measures(self, scenario: Any, target: int) -> bool:
         """Return whether a target is among those that it measures, by name, group or sort."""
         if not self.made.has_target:
             return False

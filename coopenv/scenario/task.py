@@ -9,6 +9,7 @@ from pydantic import AfterValidator, ConfigDict, Field, create_model, model_vali
 from coopenv.base import units
 from coopenv.base.errors import listed, suggest
 from coopenv.base.sections import NonNegative, Number, Positive, Section
+from coopenv.motions.own import CommandColumn
 from coopenv.scenario.terms import (
     GROUPS,
     OBSERVATION_FIELDS,
@@ -85,18 +86,25 @@ class Pan(Section):
 
 
 class Action(Section):
-    """Meaning of the entries of an action in [-1, 1]: two, with `[action.pan]` a third one, the camera's angle."""
+    """Meaning of the entries of an action in [-1, 1]: columns of the drive, two or more, then the camera's angle."""
 
     longitudinal: Literal["speed", "acceleration"] = "speed"
     """`speed`: -1..1 spans the permitted speeds (0 or -max .. max); `acceleration`: times max_acceleration."""
     steering: Annotated[Positive | None, units.TURN] = None
-    """Steering angle at action 1, rad (none: max_steering)."""
+    """Steering angle at action 1, rad (none: max_steering), of vehicles that steer."""
+    turn_rate: Annotated[Positive | None, units.TURN_RATE] = None
+    """Turn rate at action 1, rad/s (none: max_turn_rate), of vehicles with another drive."""
     pan: Pan | None = None
     """None: cameras do not turn."""
     radio: bool = False
     """Add an entry per other vehicle, in ascending order, for the message to it until the next decision: up to 0 none,
     up to 0.5 the pose alone, for its driver, above 0.5 the whole report, for its estimator, too. Otherwise reports are
     broadcast."""
+
+    def at_one(self, column: CommandColumn) -> float:
+        """Return what an entry of 1 asks of a column of the command, in the column's unit."""
+        narrowed: float | None = getattr(self, column.name, None) if column.name in type(self).model_fields else None
+        return column.high if narrowed is None else narrowed
 
 
 _built_in: dict[str, Any] = {

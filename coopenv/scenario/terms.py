@@ -118,7 +118,10 @@ FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
     ],
     "self": [
         ("steering", "vehicle", 1, "rad", "steering", -1, "steering angle, positive to the left"),
-        ("last_action", "vehicle", 3, "1", 1, -1, "action of the last decision; a third entry with `action.pan`"),
+        ("turn_rate", "vehicle", 1, "rad/s", "turn_rate", -1,
+         "turn rate of a drive without steering, positive to the left"),
+        ("lateral_speed", "vehicle", 1, "m/s", "lateral_speed", -1, "speed of an omnidirectional drive to the left"),
+        ("last_action", "vehicle", 3, "1", 1, -1, "action of the last decision, its first three entries at most"),
         ("time_left", "vehicle", 1, "horizon", 0.5, -1, "share of the horizon that is left", None, 0.5),
     ],
     "pan": [
@@ -167,9 +170,10 @@ CONDITIONS = [  # name, function, meaning
 
 
 Scale = Literal[
-    "position_scale", "velocity_scale", "angular_velocity_scale", "age_scale", "map_scale", "steering", "pan", "targets"
-]
-"""A setting of `[observation]`, the steering or the pan angle at action 1, or the number of targets."""
+    "position_scale", "velocity_scale", "angular_velocity_scale", "age_scale", "map_scale", "targets",
+    "steering", "turn_rate", "lateral_speed", "pan",
+]  # fmt: skip
+"""A setting of `[observation]`, the number of targets, or the value of an entry at action 1."""
 Per = Literal["vehicle", "target", "neighbour", "landmark"]
 """Subjects of a value: the vehicle itself, every target (landmarks, then vehicles), every other vehicle, or each of the
 landmarks that are nearest to the vehicle's own estimate."""

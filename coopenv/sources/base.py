@@ -17,38 +17,45 @@ import numpy as np
 from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import are_numbers, are_rotations
+from coopenv.motions.command import ACCELERATION, LATERAL, PAN, SPEED, TURN
 from coopenv.observers.contract import Message, ObserverInit, check_message
 from coopenv.observers.sensed import Sensed
 from coopenv.observers.setups import observer_init_of
 from coopenv.scenario import Scenario
-from coopenv.world.dynamics import ACCELERATION, PAN, SPEED, STEERING
 from coopenv.world.world import World
 
 
 @dataclass(frozen=True)
 class Command:
-    """Command of N vehicles until the next decision, see `coopenv.world.dynamics`; a vehicle that has ended stands.
+    """Command of N vehicles until the next decision, see `coopenv.motions.command`; a vehicle that has ended stands.
 
     Vehicles with prescribed motion are not driven, independent of their rows.
     """
 
     speed: Array  # (N,) m/s, to reach
-    steering: Array  # (N,) rad, positive to the left
+    turn: Array  # (N,) by the kind of motion: steering angle, rad, or turn rate, rad/s; positive to the left
     acceleration: Array  # (N,) m/s^2, at most, on the way to the speed
     pan: Array | None = None  # (N,) rad, of cameras that turn, positive to the left; None: 0
+    lateral: Array | None = None  # (N,) m/s, to the left, of drives that can; None: 0
 
     @classmethod
     def of(cls, rows: Array) -> Self:
-        """Return the command whose entries stand in the columns of (N, 4), as in a world's state; or (N, 3), no pan."""
+        """Return the command whose entries stand in the columns of (N, 5), as in a world's state; or of (N, 3 or 4)."""
         values = np.array(rows, dtype=np.float64)
-        entries = (SPEED, STEERING, ACCELERATION, PAN)[: values.shape[1]]
+        entries = (SPEED, TURN, ACCELERATION, PAN, LATERAL)[: values.shape[1]]
         return cls(*(values[:, int(entry)] for entry in entries))
 
     @property
+    def steering(self) -> Array:
+        """(N,) rad, of vehicles that steer: `turn`."""
+        return self.turn
+
+    @property
     def rows(self) -> Array:
-        """(N, 4) as in the state of a world."""
-        pan = np.zeros_like(self.speed) if self.pan is None else self.pan
-        return np.stack([self.speed, self.steering, self.acceleration, pan], axis=-1)
+        """(N, 5) as in the state of a world."""
+        zero = np.zeros_like(self.speed)
+        pan, lateral = (zero if entry is None else entry for entry in (self.pan, self.lateral))
+        return np.stack([self.speed, self.turn, self.acceleration, pan, lateral], axis=-1)
 
 
 EPISODE_OVER = "the episode is over"

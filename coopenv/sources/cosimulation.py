@@ -13,11 +13,11 @@ import numpy as np
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.installation import blamed, load_reference
 from coopenv.estimation.poses import Array, about_z
+from coopenv.motions.command import LATERAL, SPEED, TURN
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Road
 from coopenv.sources.feed import COSIMULATED, cosimulation_struct
 from coopenv.sources.worlds import Simulated, SimulatedWorld
-from coopenv.world.dynamics import SPEED, STEERING
 from coopenv.world.launch import PerWorld
 from coopenv.world.route import UNDER_WAY
 from coopenv.world.state import allocate, fields
@@ -30,13 +30,13 @@ class Poses:
     xy: Array  # (N, 2) m
     heading: Array  # (N,) rad, from x towards y
     speed: Array  # (N,) m/s
-    steering: Array  # (N,) rad, positive to the left
+    steering: Array  # (N,) rad, or the turn rate of another drive, rad/s; positive to the left
     crashed: Array  # (N,) bool, has touched something
     left: Array  # (N,) bool, has left the road for good
     traffic_position: Array  # (Z, 3) centres of boxes, m
     traffic_heading: Array  # (Z,) rad
     traffic_half: Array  # (Z, 3) half of their edges, m
-    driven: Array | bool = False  # (N,) bool, moved by commands and `[dynamics]`: poses count at the start only
+    driven: Array | bool = False  # (N,) moved by commands and `[dynamics]`: poses count at the start only
 
 
 AXES: Mapping[str, tuple[int, ...]] = {field.name: () for field in dataclass_fields(Poses)} | {
@@ -51,7 +51,7 @@ AXES: Mapping[str, tuple[int, ...]] = {field.name: () for field in dataclass_fie
 class Moment:
     """The vehicles of one world before the next tick, map frame."""
 
-    command: Array  # (N, 4) see `coopenv.world.dynamics`; zero speed and steering where the episode has ended
+    command: Array  # (N, 5) see `coopenv.motions.command`; zero speeds and steering where the episode has ended
     present: Array  # (N,) bool
     xy: Array  # (N, 2) m
     heading: Array  # (N,) rad
@@ -165,7 +165,7 @@ class CosimulatedWorld(SimulatedWorld):
         A vehicle whose episode has ended brakes with its wheels straight: it may still roll.
         """
         L, command = self.model.landmarks, np.array(self.view("command")[world], dtype=float)
-        command[np.ix_(self.view("ended")[world] != UNDER_WAY, [SPEED, STEERING])] = 0.0
+        command[np.ix_(self.view("ended")[world] != UNDER_WAY, [SPEED, TURN, LATERAL])] = 0.0
         R = self._copy("rotation", world)[L:]
         return Moment(
             command=command,

@@ -297,6 +297,10 @@ RECORDED = Source("recorded", rewind, sense_nothing, resense, sense_nothing, rec
 """Ticks of a recording, or of any other source that is not on the device."""
 
 
+PLACED = wp.constant(2)
+"""Value of `driven` of a vehicle that starts where the simulation draws it."""
+
+
 @cache
 def cosimulation_struct(p: Precision) -> Any:
     """Return the Warp struct of the poses and twists of the present tick, in one precision."""
@@ -314,7 +318,7 @@ def cosimulation_struct(p: Precision) -> Any:
         steering: array("WN", scalar)
         crashed: array("WN", wp.int32)
         left: array("WN", wp.int32)
-        driven: array("WN", wp.int32)  # moved here, by commands; its row of the others is not read
+        driven: array("WN", wp.int32)  # moved here, by commands, and its other entries are not read; or `PLACED`
 
     return HostMotion
 
@@ -324,7 +328,7 @@ def take_pose(model: Any, state: Any, motion: Any, world: int, vehicle: int):
     """Write the true pose and twist of a vehicle; the twist holds for all odometry samples of the tick."""
     recall_truth(model, state, motion, world, vehicle, world)
     state.speed[world, vehicle] = motion.speed[world, vehicle]
-    state.steering[world, vehicle] = motion.steering[world, vehicle]
+    state.turn[world, vehicle] = motion.steering[world, vehicle]
     if motion.left[world, vehicle] != 0:
         state.present[world, model.landmarks + vehicle] = 0
     for sample in range(model.samples_per_tick):
@@ -352,7 +356,8 @@ def begin_cosimulation(model: Any, state: Any, motion: Any, world: int):
     """Begin an episode where the vehicles stand; initial estimates are drawn as in the simulation."""
     place_bodies(model, state, world)
     for vehicle in range(model.vehicles):
-        take_pose(model, state, motion, world, vehicle)
+        if motion.driven[world, vehicle] != PLACED:
+            take_pose(model, state, motion, world, vehicle)
         agent = model.landmarks + vehicle
         state.start_rotation[world, agent] = state.rotation[world, agent]
         state.start_position[world, agent] = state.position[world, agent]

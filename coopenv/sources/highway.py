@@ -9,12 +9,12 @@ import numpy as np
 from coopenv.base.errors import CoopenvError, ScenarioError, error_text, listed, shown, suggest
 from coopenv.base.installation import install_command, needing
 from coopenv.estimation.poses import Array
+from coopenv.motions.command import ACCELERATION, SPEED, TURN
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Road
 from coopenv.scenario.cosimulators import Highway
 from coopenv.scenario.dynamics import Dynamics
 from coopenv.sources.cosimulation import Moment, Poses, TrafficProgram
-from coopenv.world.dynamics import ACCELERATION, SPEED, STEERING
 
 BEND = 2.0  # m, length of a strip of a lane that bends
 MARGIN = 25.0  # m, of road that is drawn beyond the outermost landmark
@@ -231,7 +231,7 @@ class Simulation(TrafficProgram):
             wanted = (command[SPEED] - car.speed) * rate
             most = command[ACCELERATION]
             gas = np.clip(wanted, -most, most) / acceleration
-            actions.append(np.array([gas, -command[STEERING] / steering]))
+            actions.append(np.array([gas, -command[TURN] / steering]))
         self._call("step", tuple(action for action, driven in zip(actions, self._driven, strict=True) if driven))
 
     def poses(self) -> Poses:

@@ -119,6 +119,12 @@ def simulation_of(scenario: Scenario) -> Simulated:
     if scenario.sensing in offered(GROUP):
         made: Simulated = call(kinds(scenario.sensing)[scenario.sensing].simulation, scenario)
         return made
+    from coopenv.scenario.schema import own_drives
+
+    if own_drives(scenario):
+        from coopenv.sources.own_drives import OwnDriven
+
+        return OwnDriven(scenario)
     from coopenv.sources.worlds import Simulated
 
     return Simulated(scenario)

@@ -287,6 +287,22 @@ class Stage:
         """Return the points that cameras see, (A, 3)."""
         return np.asarray(frame.target_position + (frame.target_rotation @ self.marker[..., None])[..., 0])
 
+    def reading_lines(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+        """Return the vehicles (m,) of measurements by sensors beside the camera, and lines (m, 2, 3) to their targets.
+
+        A measurement is shown until the next one of the sensor is due.
+        """
+        vehicles, lines = [np.empty(0, int)], [np.empty((0, 2, 3))]
+        ticks, rate, targets = frame.reading_tick, self.scenario.rates.camera, self.targets(frame)
+        for d, section in enumerate(self.scenario.sensors if ticks is not None else ()):
+            if ticks is not None and section.made.drawn == "line" and section.made.has_target:
+                since, period = frame.tick - ticks[:, d], max(1.0, rate / (section.rate or rate))
+                i, target = np.nonzero((ticks[:, d] >= 0) & (since < period))
+                start = frame.position[i] + frame.rotation[i] @ np.array(section.position)
+                vehicles.append(i)
+                lines.append(np.stack([start, targets[target]], axis=1))
+        return np.concatenate(vehicles), np.concatenate(lines)
+
     def fields_of_view(self, frame: Frame, every: int = 1, of: slice = _ALL) -> np.ndarray | None:
         """Return the fields of view in plan as polygons (N, K + 1, 3), the camera first; None where all see everything.
 

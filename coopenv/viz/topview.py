@@ -163,6 +163,7 @@ class TopView:
         self._wedges = layers.polygons(facecolor=to_rgba_array(self._rgba, 0.11), edgecolor="none")
         pale, strong = to_rgba_array(self._rgba, 0.09), to_rgba_array(self._rgba, 0.8)
         self._ellipses = layers.polygons(facecolor=pale, edgecolor=strong, linewidth=1.0)
+        self._readings = layers.lines(**ground.READING_LOOK)
         self._sight = {sight: layers.lines(**look) for sight, look in ground.SIGHT_LOOKS.items()}
         self._still = layers.points("o", DARK_BLUE, "white", 5.5)
         self._other = layers.polygons(facecolor=DARK_BLUE, edgecolor="white", linewidth=0.8)
@@ -253,6 +254,9 @@ class TopView:
             lines.set_segments(list(np.stack([eye[observer], target[seen]], axis=1)))
             if "color" not in ground.SIGHT_LOOKS[kind]:
                 lines.set_color(to_rgba_array(self._rgba[observer], 0.9))
+        observer, lines = self._stage.reading_lines(frame)
+        self._readings.set_segments(list(lines[..., :2]))
+        self._readings.set_color(to_rgba_array(self._rgba[observer], 0.9))
         wedges = self._stage.fields_of_view(frame)
         if wedges is not None:
             self._wedges.set_verts(wedges[..., :2])

@@ -63,6 +63,8 @@ SIGHT_LOOKS: dict[Sight, dict[str, object]] = {
     Sight.OCCLUDED_BY_BODY: {"linewidth": 1.1, "linestyle": DASHED, "color": INK},
 }
 """Lines of sight; lines without a colour have their observer's."""
+READING_LOOK: dict[str, object] = {"linewidth": 1.1, "linestyle": DASH_DOTTED}
+"""Measurements of sensors beside the camera, in the colour of the vehicle."""
 
 
 def pixels(x: float, y: float) -> tuple[float, float]:

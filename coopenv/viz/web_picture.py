@@ -146,6 +146,9 @@ def sight_lines(stage: Stage, frame: Frame, colours: np.ndarray, look: Look) -> 
         elif kind == Sight.OCCLUDED_BY_BODY and len(start):
             end, shade = stopped(start, end, stage.solid(frame)), np.tile(rgb(INK), (len(start), 1))
         parts.append((np.stack([start, end], axis=1), shade))
+    vehicles, lines = stage.reading_lines(frame)
+    shown = chosen[vehicles]
+    parts.append((lines[shown], colours[vehicles[shown]]))
     return _joined(parts)
 
 

@@ -11,12 +11,13 @@ from coopenv.base.errors import ScenarioError
 from coopenv.base.sections import Section
 from coopenv.estimation import KINDS, Outcome
 from coopenv.estimation.lens import largest_radius
+from coopenv.motions.table import DRIVES, MOTIONS, columns_of
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.difficulty import FASTEST_PACE, PARAMETERS
 from coopenv.scenario.dynamics import Dynamics
 from coopenv.scenario.routes import Signal, compile_motion, even_points, followers, point_count
-from coopenv.scenario.schema import agent_starts, neighbour_sets, processing_order
+from coopenv.scenario.schema import agent_starts, most_boxes, neighbour_sets, processing_order
 from coopenv.scenario.sensing import Camera, Faults, Noise, Rates, rotation_of
 from coopenv.world.model import BLIND, DRIVEN, IDEAL, PRESCRIBED, SENSED, STATIC, Precision, entry_struct, model_struct
 from coopenv.world.sensors import sensor_entries, sensor_tables
@@ -256,7 +257,7 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "vehicles": vehicles,
         "agents": agents,
         "obstacles": len(scenario.obstacles),
-        "traffic": scenario.cosimulator.most_vehicles if scenario.cosimulator else 0,
+        "traffic": most_boxes(scenario),
         "sensed": scenario.topology.mode == "sensed",
         "sensing": {"ideal": IDEAL, "blind": BLIND}.get(scenario.sensing, SENSED),
         "camera_rate": rates.camera,
@@ -266,6 +267,7 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "samples_per_tick": math.ceil(rates.odometry / rates.camera - 1e-9) + 1,
         "ticks_per_decision": scenario.ticks_per_decision,
         "action_size": scenario.action_size,
+        "columns": scenario.columns,
         "pans": scenario.action.pan is not None,
         "horizon_ticks": scenario.horizon_ticks,
         "kept": kept,
@@ -337,13 +339,23 @@ def _motion(scenario: Scenario) -> dict[str, Any]:
 
 def _dynamics(d: Dynamics, scenario: Scenario, traffic: bool) -> dict[str, Any]:
     accelerates, pan = scenario.action.longitudinal == "acceleration", scenario.action.pan
+    kind = d.model if d.model in DRIVES else DRIVES[0]  # a drive of the user's own is moved on the host
+    change, lag = (getattr(d, key) for key in MOTIONS[kind].turning)
+    speed, turn, *others = columns_of(d)
     return {
-        "min_speed": -d.max_speed if d.reverse else 0.0,
+        "kind": DRIVES.index(kind),
+        "min_speed": speed.low,
+        "max_speed": speed.high,
+        "steers": turn.unit == "rad",
+        "max_turn": turn.high,
+        "max_turn_change": change,
+        "turn_time_constant": lag,
+        "max_lateral_speed": others[0].high if others else 0.0,
         "speed_time_constant": 0.0 if accelerates or traffic else d.speed_time_constant,  # an acceleration acts at once
         "in_traffic": traffic,
         "latency_ticks": round(d.latency * scenario.rates.camera),
         "acceleration_mode": accelerates,
-        "action_steering": scenario.action.steering or d.max_steering,
+        "action_turn": scenario.action.at_one(turn),
         "pan_limit": pan.limit if pan else 0.0,
         "pan_rate": pan.rate if pan else 0.0,
     }
@@ -377,8 +389,7 @@ def _cells(scenario: Scenario) -> dict[str, Any]:
     origin, obstacles = np.array(scenario.map.origin), scenario.obstacles
     everyone: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
     reaches = [math.hypot(*agent.body.center) + math.hypot(*agent.body.size) / 2 for agent in everyone if agent.body]
-    traffic = scenario.cosimulator.most_vehicles if scenario.cosimulator else 0
-    items = max(len(everyone) + traffic, len(obstacles))
+    items = max(len(everyone) + most_boxes(scenario), len(obstacles))
     across = 1 if items <= MOST_IN_ONE_CELL else 1 << math.ceil(math.log2(items) / 2)
     ranges = [camera.range for camera in scenario.cameras if camera.range is not None]
     edge = min(ranges, default=LONGEST_CELL) / CELLS_PER_RANGE
@@ -404,7 +415,7 @@ def _cells(scenario: Scenario) -> dict[str, Any]:
 def _radio(scenario: Scenario) -> dict[str, Any]:
     return {
         "connected": [vehicle.connected for vehicle in scenario.vehicles],
-        "entry": (2 if scenario.action.pan is None else 3) if scenario.action.radio else 0,
+        "entry": scenario.columns + (scenario.action.pan is not None) if scenario.action.radio else 0,
         "to_all": scenario.v2x.links == "all",
         "slots": max(scenario.v2x.delay, 1) + 1 + scenario.replay_ticks,
     }

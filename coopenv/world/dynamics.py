@@ -1,63 +1,19 @@
-"""Commands and motion of the true vehicles.
+"""Motion of the true vehicles: commands of a decision, and the way to the next camera tick.
 
-A command is made once per decision from an action in [-1, 1] and the vehicle's limits. Its four entries follow ROS'
-AckermannDrive: target speed (m/s), steering angle (rad, positive to the left), largest change of speed (m/s^2), and the
-camera's pan angle (rad, positive to the left).
-
-A motion is prescribed in closed form, or a kinematic bicycle with its actuators.
+A motion is prescribed in closed form, or driven by a command; the kinds of motion are in `coopenv.motions`.
 """
 
 from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import increment, orthonormalise, rigid_motion
+from coopenv.estimation.linalg import orthonormalise
+from coopenv.motions import prescribed
+from coopenv.motions.command import ACCELERATION, LATERAL, PAN, SPEED, command_of, gradually, sanitised
+from coopenv.motions.dispatch import displacement, drive_step
 from coopenv.world.model import DRIVEN, PRESCRIBED
 from coopenv.world.route import UNDER_WAY
 from coopenv.world.warp_internals import device_function
-
-SPEED = wp.constant(0)
-STEERING = wp.constant(1)
-ACCELERATION = wp.constant(2)
-PAN = wp.constant(3)
-"""Entries of a command."""
-
-
-@wp.func
-def sanitised(level: Any):
-    """Return an entry of an action clipped to [-1, 1], zero where it is not finite."""
-    one = type(level)(1.0)
-    if wp.isfinite(level):
-        return wp.clamp(level, -one, one)
-    return type(level)(0.0)
-
-
-@wp.func
-def command_of(d: Any, first: Any, steering: Any, pan: Any):
-    """Return the command of an action's entries in [-1, 1] to a vehicle with the dynamics `d`.
-
-    Where the first entry means an acceleration, the speed to reach is a limit of the vehicle: the highest or, to
-    brake, the lowest.
-    """
-    one = type(first)(1.0)
-    acceleration = d.max_acceleration
-    if d.acceleration_mode == 1:
-        acceleration = wp.abs(first * d.max_acceleration)
-        speed = wp.where(first < type(first)(0.0), d.min_speed, d.max_speed)
-    else:
-        span = (d.max_speed - d.min_speed) * type(first)(0.5)
-        speed = d.min_speed + (first + one) * span
-    return wp.vector(speed, steering * d.action_steering, acceleration, pan * d.pan_limit)
-
-
-@wp.func
-def gradually(d: Any, command: Any, before: Any, duration: Any):
-    """Return a command that differs from the one before by no more than is permitted in a decision's duration, s."""
-    step = command[ACCELERATION] * duration
-    turn = d.max_steering_rate * duration
-    command[SPEED] = wp.clamp(command[SPEED], before[SPEED] - step, before[SPEED] + step)
-    command[STEERING] = wp.clamp(command[STEERING], before[STEERING] - turn, before[STEERING] + turn)
-    return command
 
 
 @device_function
@@ -68,17 +24,21 @@ def decide(model: Any, state: Any, actions: Any, world: int):
         for k in range(model.action_size):
             state.action[world, vehicle, k] = sanitised(actions[world, vehicle, k])
         first = state.action[world, vehicle, 0]
+        lateral = type(first)(0.0)
+        if model.columns > 2:
+            lateral = state.action[world, vehicle, 2]
         pan = type(first)(0.0)
         if model.pans == 1:
-            pan = state.action[world, vehicle, 2]
+            pan = state.action[world, vehicle, model.columns]
         if model.dynamics[vehicle].in_traffic == 1:
             continue
-        command = command_of(model.dynamics[vehicle], first, state.action[world, vehicle, 1], pan)
+        command = command_of(model.dynamics[vehicle], first, state.action[world, vehicle, 1], lateral, pan)
         if model.dynamics[vehicle].gated == 1:
             duration = type(first)(model.camera_period) * type(first)(model.ticks_per_decision)
             command = gradually(model.dynamics[vehicle], command, state.last_command[world, vehicle], duration)
         if state.ended[world, vehicle] != UNDER_WAY:
             command[SPEED] = type(first)(0.0)
+            command[LATERAL] = type(first)(0.0)
             command[ACCELERATION] = model.dynamics[vehicle].max_acceleration
         state.command[world, vehicle] = command
 
@@ -91,7 +51,7 @@ def command_in_force(model: Any, state: Any, world: int, vehicle: int, tick: int
     return state.command[world, vehicle]
 
 
-LONGEST_SUBSTEP = wp.constant(wp.float64(0.0100001))  # s; the bicycle's twist is held over no longer than this
+LONGEST_SUBSTEP = wp.constant(wp.float64(0.0100001))  # s; a twist is held over no longer than this
 
 
 @wp.func
@@ -119,78 +79,13 @@ def prescribe(model: Any, state: Any, world: int, agent: int, t: wp.float64):
     h = v.dtype(at - model.motion.start[segment])
     R0 = state.start_rotation[world, agent]
     R = R0 * model.motion.rotation[segment]
-    travelled = v * h
-    turned = R
-    if wp.dot(w, w) > v.dtype(0.0):
-        turn, travelled = rigid_motion(w * h, travelled)
-        turned = R * turn
+    turned, travelled = prescribed.displacement(R, v, w, h)
     state.rotation[world, agent] = turned
     state.position[world, agent] = (
         state.start_position[world, agent] + R0 * model.motion.position[segment] + R * travelled
     )
     state.velocity[world, agent] = v * pace
     state.angular_velocity[world, agent] = w * pace
-
-
-@wp.func
-def first_order_lag(value: Any, target: Any, dt: Any, lag: Any, rate: Any):
-    """Return the value after a first-order lag towards a target, its rate limited."""
-    change = target - value
-    if lag > type(lag)(0.0):
-        change = change * (type(lag)(1.0) - wp.exp(-dt / lag))
-    return value + wp.clamp(change, -rate * dt, rate * dt)
-
-
-def follow_commands(
-    wanted: wp.array3d(dtype=wp.float64),
-    lags: wp.array2d(dtype=wp.float64),
-    start: wp.float64,
-    steps: wp.array2d(dtype=wp.float64),
-    reached: wp.array3d(dtype=wp.float64),
-):
-    """Follow wanted speeds and steering angles (P, T, 2) over steps (P, T), s.
-
-    The columns of lags (P, 6) are lag of speed and steering, s, rates up, down and of steering, and the highest speed.
-    """
-    p = wp.tid()
-    speed = start
-    steering = wp.float64(0.0)
-    for k in range(wanted.shape[1]):
-        dt = steps[p, k]
-        rate = lags[p, 2]
-        if wp.abs(wanted[p, k, 0]) < wp.abs(speed):
-            rate = lags[p, 3]
-        speed = wp.clamp(first_order_lag(speed, wanted[p, k, 0], dt, lags[p, 0], rate), -lags[p, 5], lags[p, 5])
-        steering = first_order_lag(steering, wanted[p, k, 1], dt, lags[p, 1], lags[p, 4])
-        reached[p, k, 0] = speed
-        reached[p, k, 1] = steering
-
-
-@wp.func
-def actuate(d: Any, speed: Any, steering: Any, command: Any, dt: Any):
-    """Return (speed, steering) after dt under a command and limits `d`, see `coopenv.world.dynamics`."""
-    wanted = command[SPEED]
-    if wp.abs(wanted) < d.dead_band:
-        wanted = type(wanted)(0.0)
-    new_speed = first_order_lag(speed, wanted, dt, d.speed_time_constant, command[ACCELERATION])
-    angle = wp.clamp(command[STEERING], -d.max_steering, d.max_steering)
-    new_steering = first_order_lag(steering, angle, dt, d.steering_time_constant, d.max_steering_rate)
-    return wp.clamp(new_speed, d.min_speed, d.max_speed), new_steering
-
-
-@wp.func
-def bicycle_step(d: Any, R: Any, position: Any, speed: Any, steering: Any, command: Any, dt: Any, parked: int):
-    """Return (R, position, speed, steering) after dt: rear-axle bicycle, its twist held at the mid-point."""
-    new_speed, new_steering = actuate(d, speed, steering, command, dt)
-    if parked != 0:
-        new_speed = type(speed)(0.0)
-    half = type(speed)(0.5)
-    mid_speed = wp.where(parked != 0, new_speed, (speed + new_speed) * half)
-    distance = mid_speed * dt
-    o = type(position)()
-    turn = type(position)(o[0], o[1], distance * wp.tan((steering + new_steering) * half) / d.wheelbase)
-    new_R, new_position = increment(R, position, type(position)(distance, o[1], o[2]), turn, type(speed)(1.0))
-    return new_R, new_position, new_speed, new_steering
 
 
 @device_function
@@ -201,25 +96,22 @@ def drive(model: Any, state: Any, world: int, vehicle: int, command: Any, durati
     R = state.rotation[world, agent]
     position = state.position[world, agent]
     speed = state.speed[world, vehicle]
-    steering = state.steering[world, vehicle]
+    turn = state.turn[world, vehicle]
+    lateral = state.lateral_speed[world, vehicle]
     parked = wp.where(state.present[world, agent] == 0, 1, state.ended[world, vehicle])
     steps = int(wp.ceil(duration / LONGEST_SUBSTEP))
     dt = type(speed)(duration / wp.float64(wp.max(steps, 1)))
     for _ in range(steps):
-        R, position, speed, steering = bicycle_step(limits, R, position, speed, steering, command, dt, parked)
-    o = type(position)()
+        R, position, speed, turn, lateral = drive_step(limits, R, position, speed, turn, lateral, command, dt, parked)
     state.rotation[world, agent] = orthonormalise(R)
     state.position[world, agent] = position
     state.speed[world, vehicle] = speed
-    state.steering[world, vehicle] = steering
-    state.velocity[world, agent] = type(o)(speed, o[1], o[2])
-    state.angular_velocity[world, agent] = type(o)(o[0], o[1], yaw_rate(limits, speed, steering))
-
-
-@wp.func
-def yaw_rate(d: Any, speed: Any, steering: Any):
-    """Return the bicycle's yaw rate, rad/s."""
-    return speed * wp.tan(steering) / d.wheelbase
+    state.turn[world, vehicle] = turn
+    state.lateral_speed[world, vehicle] = lateral
+    second = type(speed)(wp.where(parked != 0, 0.0, 1.0))
+    velocity, angular_velocity = displacement(limits, speed, turn, lateral, second, position)
+    state.velocity[world, agent] = velocity
+    state.angular_velocity[world, agent] = angular_velocity
 
 
 @device_function

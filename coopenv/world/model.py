@@ -23,7 +23,7 @@ class Precision:
     numpy: Any
     vec2: Any
     vec3: Any
-    vec4: Any
+    vec5: Any
     vec6: Any
     mat33: Any
     mat66: Any
@@ -31,7 +31,7 @@ class Precision:
 
 def _precision(scalar: Any) -> Precision:
     vector, matrix, number = wp.types.vector, wp.types.matrix, wp.dtype_to_numpy(scalar)
-    small = vector(2, scalar), vector(3, scalar), vector(4, scalar), vector(6, scalar), matrix((3, 3), scalar)
+    small = vector(2, scalar), vector(3, scalar), vector(5, scalar), vector(6, scalar), matrix((3, 3), scalar)
     return Precision(scalar.__name__, scalar, number, *small, matrix((6, 6), scalar))
 
 
@@ -119,22 +119,25 @@ def model_struct(p: Precision) -> Any:
 
     @wp.struct
     class DynamicsValues:
-        """Kinematic bicycle and actuators of one vehicle; m, s, rad."""
+        """Kind of motion, limits and actuators of one vehicle; m, s, rad."""
 
+        kind: wp.int32  # place in `coopenv.motions.table.DRIVES`
         wheelbase: scalar
         max_speed: scalar
         min_speed: scalar
         max_acceleration: scalar
-        max_steering: scalar
-        max_steering_rate: scalar
+        steers: wp.int32  # 1: the second column of a command is an angle (rad), not a rate
+        max_turn: scalar  # of the second column of a command: rad, or rad/s
+        max_turn_change: scalar  # per s
+        max_lateral_speed: scalar  # 0: the kind does not move sideways
         speed_time_constant: scalar
-        steering_time_constant: scalar
+        turn_time_constant: scalar
         latency_ticks: wp.int32
         dead_band: scalar  # m/s
         gated: wp.int32  # 1: commands change gradually
         in_traffic: wp.int32  # 1: the model of traffic drives it, see `coopenv.world.route`
         acceleration_mode: wp.int32  # 1: the first entry of an action is an acceleration
-        action_steering: scalar  # of an action of 1
+        action_turn: scalar  # of an action of 1
         pan_limit: scalar  # of the camera; 0: it does not turn
         pan_rate: scalar
 
@@ -262,9 +265,13 @@ def model_struct(p: Precision) -> Any:
 
         rotation: mat33  # sensor to body
         position: vec3  # body frame, m
+        kind: wp.int32  # its place in `coopenv.measurements.kinds.KINDS`; -1: a class of one's own
+        rows: wp.int32
         has_target: wp.int32  # 0: it measures the map
         ratio: wp.float64  # measurements per tick, at most 1
         std: vec6  # of white noise
+        counted: vec6  # standard deviations by which filters count its noise
+        weight: vec6  # of rows in the sliding Gramian, relative to a bearing of the camera
         bias: vec6  # standard deviations of an error per vehicle and episode
         correlated: vec6  # standard deviations of a Gauss-Markov process
         correlation: scalar  # of that with itself one tick later
@@ -376,7 +383,8 @@ def model_struct(p: Precision) -> Any:
         samples_per_tick: wp.int32  # odometry samples that may fall into one camera tick
         ticks_per_decision: wp.int32
         action_size: wp.int32  # numbers of an action
-        pans: wp.int32  # whether the third is the camera's angle
+        columns: wp.int32  # the first of them, which drive
+        pans: wp.int32  # whether the next one is the camera's angle
         horizon_ticks: wp.int32
         coordinates: wp.int32  # in which the observer states its covariance at first, see `coopenv.world.quality`
         kept: wp.int32  # agents that a vehicle keeps at a time, see `coopenv.world.nearby`; 0: all

@@ -126,6 +126,10 @@ def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: i
             G11 += dt * (wp.dot(z, z) * i3 - wp.outer(z, z) - wp.outer(m, m))
             G12 += dt * (skew(z) - wp.outer(m, b))
             G22 += dt * (i3 - wp.outer(b, b))
+    for sensor in range(state.information_11.shape[2]):
+        G11 += dt * state.information_11[world, vehicle, sensor]
+        G12 += dt * state.information_12[world, vehicle, sensor]
+        G22 += dt * state.information_22[world, vehicle, sensor]
     state.gramian_11[world, vehicle, block] = G11
     state.gramian_12[world, vehicle, block] = G12
     state.gramian_22[world, vehicle, block] = G22

@@ -8,7 +8,8 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import exp_so3, identity3, join6, orthonormalise
-from coopenv.world.dynamics import command_of, prescribe
+from coopenv.motions.command import command_of
+from coopenv.world.dynamics import prescribe
 from coopenv.world.model import DRIVEN, PRESCRIBED
 from coopenv.world.nearby import clear_cells, clear_entries, put_into_cell
 from coopenv.world.quality import empty_block
@@ -172,14 +173,15 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
         speed = speed + model.drawn.speed_spread[vehicle] * signed_uniform(words[0], o.dtype(1.0))
         speed = wp.clamp(speed, model.dynamics[vehicle].min_speed, model.dynamics[vehicle].max_speed)
     state.speed[world, vehicle] = speed
-    state.steering[world, vehicle] = o[0]
+    state.turn[world, vehicle] = o[0]
+    state.lateral_speed[world, vehicle] = o[0]
     # The action in force before the first decision keeps the start speed, or accelerates by nothing.
     level = o[0]
     limits = model.dynamics[vehicle]
     if limits.acceleration_mode == 0:
         span = limits.max_speed - limits.min_speed
         level = (speed - limits.min_speed) * o.dtype(2.0) / span - o.dtype(1.0)
-    command = command_of(limits, level, o[0], o[0])
+    command = command_of(limits, level, o[0], o[0], o[0])
     state.action[world, vehicle, 0] = level
     for k in range(1, model.action_size):
         state.action[world, vehicle, k] = o[0]

@@ -393,7 +393,7 @@ def direct_traffic(model: Any, state: Any, world: int, vehicle: int, tick: int):
     acceleration = wp.min(acceleration, following_acceleration(speed, wanted, signal, speed - speed))
     rate = wp.min(wp.abs(acceleration), limits.max_acceleration)
     target = wp.where(acceleration > speed - speed, limits.max_speed, speed - speed)
-    state.command[world, vehicle] = wp.vector(target, steering, rate, speed - speed)
+    state.command[world, vehicle] = wp.vector(target, steering, rate, speed - speed, speed - speed)
 
 
 @device_function

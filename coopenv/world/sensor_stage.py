@@ -1,6 +1,7 @@
 """The sensors beside the camera of a batch of worlds: launches of their kernels, and users' kinds on the host."""
 
 import re
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from coopenv.base.errors import CoopenvError
 from coopenv.measurements.kinds import MOST_ROWS, Placed
 from coopenv.measurements.sensor import Sensor
-from coopenv.scenario import Scenario
+from coopenv.scenario.sensors import SensorSection
 from coopenv.world.embedded import Nothing
 from coopenv.world.launch import Call, PerWorld
 from coopenv.world.model import Precision
@@ -23,32 +24,37 @@ Indices = NDArray[np.int64]
 class SensorStage:
     """The stage of all sensors beside the camera."""
 
-    def __init__(self, scenario: Scenario, model: Any, state: Any, mask: Any, p: Precision) -> None:
+    def __init__(
+        self, sections: Sequence[SensorSection], model: Any, state: Any, mask: Any, p: Precision, names: Sequence[str]
+    ) -> None:
         """Find the kernels.
 
         Args:
-            scenario: of all worlds.
+            sections: of all sensors of the scenario; empty if a source gives their measurements.
             model: of the scenario.
             state: of the worlds.
             mask: (W,) as `World.mask`.
             p: precision of both.
+            names: of the targets.
 
         Raises:
             CoopenvError: a user's kind on another device than the CPU.
         """
-        self._scenario, self._model, self._state, self._mask = scenario, model, state, mask
-        self._kinds = [section.made for section in scenario.sensors]
+        self._sections, self._model, self._state, self._mask, self._names = sections, model, state, mask, names
+        self._kinds = [section.made for section in sections]
+        self.there = len(sections) > 0
+        """True if there is a sensor."""
         self.own = [d for d, kind in enumerate(self._kinds) if kind.in_warp is None]
         """Sensors whose values the host computes."""
         device = state.tick.device
         for d in self.own if not device.is_cpu else ():
-            section = scenario.sensors[d]
-            raise CoopenvError(f"sensors.{section.label}: '{section.kind}' measures on the host; use device='cpu'")
+            name, kind = sections[d].label, sections[d].kind
+            raise CoopenvError(f"sensors.{name}: '{kind}' measures on the host; use device='cpu'")
         if self.own:
             self._drawn = allocate(drawn_struct(p), state_sizes(model, len(state.tick)), str(device))
         self._kernels = [
             sensor_kernel("own" if kind.in_warp is None else re.sub(r"\W", "_", section.kind), kind.in_warp, p)
-            for section, kind in zip(scenario.sensors, self._kinds, strict=True)
+            for section, kind in zip(sections, self._kinds, strict=True)
         ]
 
     def calls(self, begins: bool = False) -> list[Call]:
@@ -95,7 +101,7 @@ class SensorStage:
         L, markers = self._model.landmarks, np.array(self._model.scene.marker.numpy(), float)
         R, position, velocity, turning = (np.array(getattr(self._state, name).numpy()[w], float) for name in POSES)
         points = position + (R @ markers[..., None])[..., 0]
-        marks = dict(zip(self._scenario.target_names[:L], points[:L], strict=True))
+        marks = dict(zip(self._names[:L], points[:L], strict=True))
         at = L + i
         own = self._sensors[d].placed(R[at], position[at], velocity[at], turning[at], marks)
         if not self._kinds[d].has_target:
@@ -106,10 +112,10 @@ class SensorStage:
     @cached_property
     def _sensors(self) -> dict[int, Sensor]:
         """Users' sensors, for their places on bodies."""
-        sections, nothing = self._scenario.sensors, np.empty(0)
+        nothing = np.empty(0)
         return {
             d: Sensor(s.label, s.kind, nothing, nothing.astype(int), np.array(s.position), s.mounting, s.arguments)
-            for d, s in enumerate(sections)
+            for d, s in enumerate(self._sections)
             if d in self.own
         }
 

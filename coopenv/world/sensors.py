@@ -13,7 +13,9 @@ import numpy as np
 import warp as wp
 
 from coopenv.estimation import Sight
-from coopenv.measurements.kinds import MOST_ROWS, WarpFunctions
+from coopenv.estimation.poses import Array
+from coopenv.measurements.bearing import Bearing
+from coopenv.measurements.kinds import KINDS, MOST_ROWS, WarpFunctions
 from coopenv.scenario import Scenario
 from coopenv.scenario.sensors import SensorSection
 from coopenv.world.camera import behind_building, inverse_square_of, marker_position, occlusion
@@ -28,6 +30,7 @@ from coopenv.world.random import (
     six_gaussians,
     uniform,
 )
+from coopenv.world.sensor_information import clear_information, inform_of
 from coopenv.world.state import array, state_struct
 from coopenv.world.step import is_active
 from coopenv.world.warp_internals import device_function
@@ -48,9 +51,13 @@ def sensor_entries(section: SensorSection, scenario: Scenario) -> dict[str, Any]
     return {
         "rotation": section.mounting,
         "position": section.position,
+        "kind": [*KINDS].index(section.kind) if section.kind in KINDS else -1,
+        "rows": kind.rows,
         "has_target": kind.has_target,
         "ratio": min(1.0, (section.rate or camera) / camera),
         "std": on * np.pad(section.white, (0, MOST_ROWS - kind.rows)),
+        "counted": on * np.pad(section.counted(camera), (0, MOST_ROWS - kind.rows)),
+        "weight": _weights(section, scenario),
         "bias": on * section.bias * rows,
         "correlated": on * correlated.std * rows,
         "correlation": math.exp(-1.0 / (camera * correlated.time)),
@@ -64,6 +71,12 @@ def sensor_entries(section: SensorSection, scenario: Scenario) -> dict[str, Any]
         "occluded": section.occluded,
         "under_sky": kind.under_sky,
     }
+
+
+def _weights(section: SensorSection, scenario: Scenario) -> Array:
+    """Return the weights (6,) of rows relative to a bearing of the camera: the ratios of their information."""
+    bearing = scenario.noise.bearing.scale or Bearing.noise[0]
+    return np.pad(np.square(bearing / section.white), (0, MOST_ROWS - len(section.white)))
 
 
 def sensor_tables(scenario: Scenario) -> dict[str, Any]:
@@ -124,6 +137,7 @@ def forget_readings(state: Any, world: int, vehicle: int, sensor: int):
     empty = type(state.sensor_drift[world, vehicle, sensor])()
     state.sensor_drift[world, vehicle, sensor] = empty
     state.sensor_outage[world, vehicle, sensor] = 0
+    clear_information(state, world, vehicle, sensor)
     for entry in range(state.reading.shape[3]):
         state.reading[world, vehicle, sensor, entry] = empty
         state.reading_tick[world, vehicle, sensor, entry] = -1
@@ -206,6 +220,7 @@ def _sensing(write: Any) -> Any:
             forget_readings(state, world, vehicle, sensor)
         if model.carries[vehicle, sensor] == 0:
             return
+        clear_information(state, world, vehicle, sensor)
         carry_errors(model, state, world, vehicle, sensor, tick)
         out = state.sensor_outage[world, vehicle, sensor] == 1 and model.sensing != IDEAL
         if out or model.sensing == BLIND or state.present[world, agent] == 0 or not is_due_at(own.ratio, tick):
@@ -226,7 +241,7 @@ def _sensing(write: Any) -> Any:
 
 def _value_writer(functions: WarpFunctions) -> Any:
     """Return the Warp function that writes the value of a kind."""
-    predict, sample = functions.predict, functions.sample
+    predict, sample, inform = functions.predict, functions.sample, inform_of(functions)
 
     @device_function
     def write_value(
@@ -255,6 +270,7 @@ def _value_writer(functions: WarpFunctions) -> Any:
         noise = noise_of(model, state, world, vehicle, sensor, target, tick)
         state.reading[world, vehicle, sensor, target] = sample(predicted, noise, origin)
         state.reading_tick[world, vehicle, sensor, target] = tick
+        inform(model, state, world, vehicle, sensor, target, tick)
 
     return write_value
 
@@ -282,13 +298,13 @@ def drawn_struct(p: Precision) -> Any:
     """Return the Warp struct of the measurements of users' kinds, in one precision."""
 
     @wp.struct
-    class Drawn:
+    class DrawnNoise:
         """Measurements that are made, without their values."""
 
         noise: array("WNRX", p.vec6)  # in the rows of the kind
         measured: array("WNRX", wp.int32)  # 1: a value of this tick is to be computed
 
-    return Drawn
+    return DrawnNoise
 
 
 @cache

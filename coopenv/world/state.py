@@ -2,10 +2,10 @@
 
 W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders), M odometry samples a tick, S slots of
 the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q parameters, U numbers of an action, Z bodies
-of the traffic, G cells of the grid, I items in it. Measurements and messages have
-X entries, one per agent, and Y boxes, one per sender, or as many as are kept (V), see `coopenv.world.nearby`; E agents
-that may be off on maps. R sensors beside the camera. L lanes of scratch: indexed by vehicle, shared by the vehicles
-that one thread takes in turn.
+of the traffic, G cells of the grid, I items in it. Measurements and messages have X entries, one per agent, and Y
+boxes, one per sender, or as many as are kept (V), see `coopenv.world.nearby`; E agents that may be off on maps. R
+sensors beside the camera; F measurements of a frame at most, in pairs of rows. L lanes of scratch: indexed by vehicle,
+shared by the vehicles that one thread takes in turn.
 
 A field of a record states its axes once, a letter each, and is allocated by them. It also states the rule of its saved
 values; all rules are checked before anything is restored.
@@ -24,6 +24,7 @@ from coopenv.base.sections import LARGEST
 from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import Fields, Mask, Rule, are_covariances, are_rotations, are_unit_vectors, everywhere
+from coopenv.measurements.kinds import MOST_ROWS
 from coopenv.scenario.difficulty import MOST, PARAMETERS
 from coopenv.world.model import Precision
 from coopenv.world.warp_internals import field_types, struct_of
@@ -44,6 +45,7 @@ def fields(record: Any) -> dict[str, Any]:
     return {name: kind for name, kind in field_types(record).items() if hasattr(kind, "axes")}
 
 
+PAIRS_OF_ROWS = MOST_ROWS // 2  # of a measurement
 SCRATCH = "L"
 """The second axis of scratch."""
 
@@ -192,6 +194,10 @@ ROUTE_DRAWN = Rule(
     "a number of a route, or -1",
     lambda values, fields, model: (values >= -1) & (values < max(model.routes.count.size, 1)),
 )
+TURN = Rule(
+    "a steering angle of at most 1.6 rad, or a turn rate",
+    lambda values, fields, model: np.abs(values) <= np.where(model.dynamics.numpy()["steers"] == 1, 1.6, LARGEST),
+)
 KEPT_AGENT = Rule(
     "an agent where one is kept, otherwise -1",
     lambda values, fields, model: np.where(
@@ -276,7 +282,7 @@ def _converted(name: str, values: Mapping[str, Any], like: Array) -> Array:
 @cache
 def state_struct(p: Precision) -> Any:
     """Return the Warp struct of the state in one precision."""
-    scalar, vec2, vec3, vec4, vec6 = p.scalar, p.vec2, p.vec3, p.vec4, p.vec6
+    scalar, vec2, vec3, vec5, vec6 = p.scalar, p.vec2, p.vec3, p.vec5, p.vec6
     mat33, mat66 = p.mat33, p.mat66
 
     @wp.struct
@@ -307,12 +313,13 @@ def state_struct(p: Precision) -> Any:
         position: array("WA", vec3, TRUTH)  # truth, map
         velocity: array("WA", vec3, TRUTH)  # truth, body, m/s
         angular_velocity: array("WA", vec3, TRUTH)  # truth, body, rad/s
-        speed: array("WN", scalar)  # of the bicycle, m/s
-        steering: array("WN", scalar, numbers(1.6))  # rad
+        speed: array("WN", scalar)  # forwards, m/s
+        turn: array("WN", scalar, TURN)  # steering angle, rad, or turn rate, rad/s, by the kind of motion
+        lateral_speed: array("WN", scalar)  # to the left, m/s
         pan: array("WN", scalar, numbers(3.15))  # angle by which the camera is turned to the left, rad
         action: array("WNU", scalar, numbers(1.001))  # of the current decision, in [-1, 1]
-        command: array("WN", vec4)  # target: speed m/s, steering rad, acceleration m/s^2, pan rad
-        last_command: array("WN", vec4)  # of the decision before, in force during the dead time
+        command: array("WN", vec5)  # see `coopenv.motions.command`
+        last_command: array("WN", vec5)  # of the decision before, in force during the dead time
         ended: array("WN", wp.int32, whole(-1, "last_outcome"))  # `Outcome`, then the scenario's own conditions
         collided: array("WN", wp.int32, FLAG)  # touching something now
 
@@ -353,6 +360,9 @@ def state_struct(p: Precision) -> Any:
 
         reading: array("WNRX", vec6)  # last value of a sensor beside the camera; of the map: in the first entry
         reading_tick: array("WNRX", wp.int32, TICK)  # tick of that value; -1: never
+        information_11: array("WNR", mat33)  # C^T C of a sensor's measurements at this tick, map axes
+        information_12: array("WNR", mat33)
+        information_22: array("WNR", mat33)
         sensor_drift: array("WNR", vec6, TRUTH)  # truth: correlated error of its rows
         sensor_outage: array("WNR", wp.int32, FLAG)  # truth: 1: it measures nothing for a while
 
@@ -417,14 +427,10 @@ def state_sizes(model: Any, worlds: int) -> dict[str, int]:
     }
     grid = {"G": model.cells.across**2, "I": model.agents + model.traffic}
     ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
-    draws = {
-        "R": model.sensor.shape[0],
-        "P": model.routes.points,
-        "Q": len(PARAMETERS),
-        "Z": model.traffic,
-        "U": model.action_size,
-    }
-    return {"W": worlds, "A": A, "N": N, "L": N, "R": model.sensor.shape[0], **draws, **ticks, **grid, **near}
+    draws = {"P": model.routes.points, "Q": len(PARAMETERS), "Z": model.traffic, "U": model.action_size}
+    sensors = 0 if model.sensor is None else model.sensor.shape[0]
+    rows = {"R": sensors, "F": near["X"] * (1 + PAIRS_OF_ROWS * sensors)}
+    return {"W": worlds, "A": A, "N": N, "L": N, **rows, **draws, **ticks, **grid, **near}
 
 
 def allocate_state(model: Any, worlds: int, p: Precision, device: str, shared: str = "") -> Any:

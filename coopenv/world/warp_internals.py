@@ -50,7 +50,7 @@ class _ByReference(wp.Function):
 
     def get_overload(self, arg_types: Any, kwarg_types: Mapping[str, Any]) -> Any:
         """Return the overload for types of arguments, see `wp.Function`."""
-        overload: Any = super().get_overload(arg_types, kwarg_types)
+        overload: Any = super().get_overload([codegen.strip_reference(kind) for kind in arg_types], kwarg_types)
         if overload is not None:
             given = overload.input_types.items()
             types = {name: _REFERENCE[kind] if _has_arrays(kind) else kind for name, kind in given}
@@ -166,6 +166,21 @@ def subroutine(function: Callable[..., Any]) -> Any:
     made = device_function(function)
     made.inline_hint = "noinline"
     return made
+
+
+def overload_of(function: Any, subroutine: bool = False) -> Callable[[Callable[..., Any]], Any]:
+    """Make another Warp function an overload of a `device_function`: Warp chooses by the types of the arguments.
+
+    At least one argument of both is generic (`Any`). `subroutine`: it is never inlined.
+    """
+
+    def add(other: Callable[..., Any]) -> Any:
+        made = device_function(other)
+        made.inline_hint = "noinline" if subroutine else None
+        function.add_overload(made)
+        return made
+
+    return add
 
 
 def struct_of(record: Any) -> Any:

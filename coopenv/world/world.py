@@ -142,10 +142,9 @@ class World:
         self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         """(W,) worlds that `restart` resets and that `advance` leaves alone; zero between calls."""
         self.launch = Launcher(worlds, self.device, dtype, shares, lanes, needed // worlds)
-        self.sensors = None
-        """Stage of the sensors beside the camera; None: there are none, or the source gives their readings."""
-        if scenario.sensors and self.source.knows_truth:
-            self.sensors = SensorStage(scenario, self.model, self.state, self.mask, self.precision)
+        sensors = scenario.sensors if self.source.knows_truth else ()  # other sources give their readings
+        self.sensors = SensorStage(sensors, self.model, self.state, self.mask, self.precision, scenario.target_names)
+        """Stage of the sensors beside the camera."""
         self._views: dict[str, np.ndarray] = {}
 
     def _build_model(self) -> Any:
@@ -212,14 +211,14 @@ class World:
     @property
     def _world_kernels(self) -> Kernels:
         """Kernels of the source with the observer, or without it."""
-        if self.observer.fused and self.source.fused and self.launch.lanes == 1 and self.sensors is None:
+        if self.observer.fused and self.source.fused and self.launch.lanes == 1 and not self.sensors.there:
             return fused_kernels(self.source, self.observer, self.precision)
         return source_kernels(self.source, self.precision)
 
     def restart(self) -> None:
         """Start the next episode in the worlds of `self.mask`, on the device."""
         self._run("begin", self._world_kernels["begin"], self._record, PerWorld(self.mask))
-        if self.sensors is not None:
+        if self.sensors.there:
             self.launch.by_lane("begin sensors", *self.sensors.calls(begins=True))
             self.sensors.compute(begins=True)
         if self.observer.starts:
@@ -233,7 +232,7 @@ class World:
         memory, hold = PerWorld(self.memory), PerWorld(self.mask)
         self._revive(ticks)
         sensing = self._world_kernels
-        if self.launch.lanes > 1 or self._computes or (self.in_parts and self.model.radio.delay == 0):
+        if self.launch.lanes > 1 or self.sensors.own or (self.in_parts and self.model.radio.delay == 0):
             self._advance_in_lanes(ticks)
         elif "advance" in sensing:
             arguments = [memory, self._record, PerWorld(self.actions), hold, ticks]
@@ -255,7 +254,7 @@ class World:
         self.decide()
         for _ in range(ticks):
             self._move()
-            if self.model.radio.delay > 0 and not self._computes:
+            if self.model.radio.delay > 0 and not self.sensors.own:
                 self.launch.by_lane("look and follow", *self._look(LOOK), *self._follow())
             else:
                 self._look_around()
@@ -303,18 +302,12 @@ class World:
 
     def _look(self, stages: int) -> list[Call]:
         """Return the launches of stages of a tick before observers, and of the sensors beside the camera."""
-        return [self._sense(stages), *(self.sensors.calls() if self.sensors is not None else [])]
-
-    @property
-    def _computes(self) -> bool:
-        """True if the host computes what some sensors measure."""
-        return self.sensors is not None and len(self.sensors.own) > 0
+        return [self._sense(stages), *self.sensors.calls()]
 
     def _look_around(self) -> None:
         """Measure after everything has moved, in lanes."""
         self.launch.by_lane("look", *self._look(LOOK))
-        if self.sensors is not None:
-            self.sensors.compute()
+        self.sensors.compute()
 
     def _follow(self, ends: int = 0, turns: Any = None) -> list[Call]:
         """Return the launches of the observers, in turn; with `ends` the last one ends the tick."""
@@ -365,8 +358,7 @@ class World:
         """Move the truth to the next tick and measure it."""
         if self.launch.lanes == 1:
             self.launch.by_lane("sense", *self._look(SENSE))
-            if self.sensors is not None:
-                self.sensors.compute()
+            self.sensors.compute()
         else:
             self._move()
             self._look_around()

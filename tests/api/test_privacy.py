@@ -11,6 +11,8 @@ from numpy.testing import assert_allclose
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.evaluation.episodes import driven_vehicles
+from coopenv.measurements.kinds import KINDS
+from coopenv.measurements.sensor import kind_of
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.schema import neighbour_sets
 from coopenv.scenario.terms import GROUPS
@@ -102,6 +104,44 @@ def test_observation_does_not_move_when_everything_moves_together(name: str, obs
     for _ in range(10):
         engine.step(np.zeros((2, len(scenario.vehicles), 2)))
         assert np.array_equal(engine.view("observation")[0, 0], engine.view("observation")[1, 0])
+
+
+WITH_TARGETS = [{"kind": kind, "towards": ["landmarks", "vehicles"]} for kind in KINDS if kind_of(kind).has_target]
+
+
+@pytest.mark.parametrize("observer", OBSERVERS)
+def test_sensors_out_of_reach_do_not_let_hidden_truth_through(observer: str) -> None:
+    sensors = [{**sensor, "range": 1e-6, "bias": 0.1, "correlated": {"std": 0.1}} for sensor in WITH_TARGETS]
+    scenario = silent("busy_intersection", observer, {"sensors": sensors})
+    engine = Engine(scenario, 2, "float64")
+    engine.reset([5, 5])
+    state = engine.get_state()
+    state["position"][1, len(scenario.landmarks) :] += np.array([0.3, -0.2, 0.1])
+    engine.set_state(state)
+    for _ in range(8):
+        engine.step(np.zeros((2, len(scenario.vehicles), 2)))
+        assert np.array_equal(*engine.view("observation"))
+
+
+def test_a_tick_holds_of_the_truth_no_more_than_its_measurements() -> None:
+    """A world that is moved as a whole gives the same ticks: only measured positions, and the map, move with it."""
+    sensors = [*WITH_TARGETS, {"kind": "attitude"}, {"kind": "position", "rate": 10.0}]
+    engine = Engine(load_scenario("busy_intersection", {"sensors": sensors}), 2, "float64")
+    engine.reset([5, 5])
+    state, away = engine.get_state(), np.array([7.0, -5.0, 2.0])
+    for name in ("position", "start_position"):
+        state[name][1] += away
+    engine.set_state(state)
+    for k in range(1, 9):
+        engine.world.advance(1)
+        here, there = (engine.world.sensed(w, k) for w in range(2))  # type: ignore[attr-defined]
+        for name, values in here.measured().items():
+            moved = away if name == "landmarks" else 0.0
+            assert_allclose(getattr(there, name), values + moved, atol=1e-9, err_msg=name)
+        for name, values in here.readings.items():
+            moved = away if name == "position" else 0.0
+            assert_allclose(there.readings[name], values + moved, atol=1e-9, err_msg=name)
+        assert there.messages == {} and there.truth is None
 
 
 def explained(inputs: np.ndarray, outputs: np.ndarray, fit: int) -> np.ndarray:

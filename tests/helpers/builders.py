@@ -91,7 +91,7 @@ def run(world: World, ticks: int, *names: str) -> list[dict[str, np.ndarray]]:
 
 
 def command(world: World, actions: Any) -> None:
-    world.actions.assign(np.broadcast_to(actions, (world.worlds, world.model.vehicles, 2)).copy())
+    world.actions.assign(np.broadcast_to(actions, (world.worlds, world.model.vehicles, world.model.action_size)).copy())
 
 
 def estimated_position(state: dict[str, np.ndarray]) -> np.ndarray:

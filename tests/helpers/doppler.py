@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from coopenv.measurements.kinds import Placed
+import numpy as np
+import warp as wp
+
+from coopenv.measurements.in_warp import plus_noise
+from coopenv.measurements.kinds import Placed, WarpFunctions
 
 
 class Doppler:
@@ -16,6 +20,19 @@ class Doppler:
     def predict(self, own: Placed, target: Placed) -> np.ndarray:
         line = target.position - own.position
         return line @ (target.velocity - own.velocity) / np.linalg.norm(line)
+
+
+@wp.func
+def predict_doppler(R: Any, p: Any, v: Any, target_R: Any, target_p: Any, target_v: Any, empty: Any):
+    """Return the speed at which the distance grows, m/s."""
+    o = empty.dtype(0.0)
+    return type(empty)(wp.dot(wp.normalize(target_p - p), target_v - v), o, o, o, o, o)
+
+
+class DopplerInWarp(Doppler):
+    """The same sensor with functions for kernels."""
+
+    in_warp = WarpFunctions(predict_doppler, plus_noise)
 
 
 class NearDoppler(Doppler):

@@ -268,3 +268,17 @@ def test_files_of_sumo_that_are_wrong_are_one_line(tmp_path: Path, file: str, te
     (tmp_path / file).write_text(text)
     with pytest.raises(CoopenvError, match=why):
         coopenv.scenario.parse_scenario(raw, "corner")
+
+
+def test_vehicles_that_a_program_moves_measure_with_sensors(own: dict[str, Any]) -> None:
+    sensors = [{"kind": kind, "towards": ["vehicles"]} for kind in ("range", "tests.helpers.doppler:Doppler")]
+    engine = Engine(coopenv.scenario.parse_scenario({**own, "sensors": sensors}, "circle"), 1, "float64")
+    engine.reset([0])
+    for k in range(1, 6):
+        engine.step(np.zeros((1, 2, 2)))
+        readings = engine.world.sensed(0, k).readings  # type: ignore[attr-defined]
+        R, velocity, position = (engine.view(name)[0, -2:] for name in ("rotation", "velocity", "position"))
+        line = position[0] - position[1]
+        assert readings["range"][1, 3] == pytest.approx(np.linalg.norm(line))
+        growing = line @ (R[0] @ velocity[0] - R[1] @ velocity[1]) / np.linalg.norm(line)
+        assert readings["doppler"][1, 3] == pytest.approx(growing)

@@ -82,7 +82,7 @@ def test_commands_are_speeds_and_steering_to_the_left() -> None:
     assert env.engine.view("speed")[0, 3] == pytest.approx(3.0, abs=1e-6)
     *_, infos = env.step({agent: np.array([-0.5, 1.0]) for agent in env.agents})
     assert infos["vehicle_4"]["truth"]["angular_velocity"][2] > 0.2
-    assert env.engine.view("steering")[0, 3] == pytest.approx(0.5)
+    assert env.engine.view("turn")[0, 3] == pytest.approx(0.5)
 
 
 def test_traffic_ignores_commands() -> None:

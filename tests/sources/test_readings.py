@@ -174,7 +174,7 @@ def test_wrong_readings_of_robots_are_named(readings: dict[str, Any], problem: s
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
-        ({"std": np.array([0.1, 0.1])}, r"setups\.0\.sensors\.'uwb'\.std: not 1 positive numbers"),
+        ({"std": np.array([0.1, 0.1])}, r"setups\.0\.sensors\.'uwb'\.std: not an array of shape \(1,\)"),
         ({"reference": "sonar"}, r"sensors\.'uwb': unknown kind of sensor 'sonar'"),
         ({"rotation": 2.0 * np.eye(3)}, r"sensors\.'uwb'\.rotation: not a rotation"),
         ({"targets": np.array([MAP])}, r"sensors\.'uwb'\.targets: not among the targets of vehicle_1"),

@@ -350,13 +350,12 @@ def test_a_recording_of_a_recording_is_the_recording() -> None:
 
 
 def test_commands_and_their_rows() -> None:
-    rows = np.arange(8.0).reshape(2, 4)
-    for command in (Command.of(rows), Command.of(rows[:, :3])):
-        assert command.speed.tolist() == [0, 4] and command.steering.tolist() == [1, 5]
-        assert command.acceleration.tolist() == [2, 6]
-        pan = [0, 0] if command.pan is None else command.pan
-        assert np.array_equal(command.rows, np.column_stack([rows[:, :3], pan]))
-    assert np.array_equal(Command.of(rows).rows, rows)
+    rows = np.arange(10.0).reshape(2, 5)
+    for columns in (5, 4, 3):
+        command = Command.of(rows[:, :columns])
+        assert command.speed.tolist() == [0, 5] and command.turn.tolist() == command.steering.tolist() == [1, 6]
+        assert command.acceleration.tolist() == [2, 7]
+        assert np.array_equal(command.rows, np.where(np.arange(5) < columns, rows, 0.0))
 
 
 def test_ticks_are_for_one_world_on_the_cpu() -> None:

@@ -47,9 +47,7 @@ def drive(
 def path(states: list[dict[str, Any]]) -> np.ndarray:
     """Return (x, y, yaw, speed, steering) per state."""
     yaw = [Rotation.from_matrix(s["rotation"][0, -1]).as_euler("zyx")[0] for s in states]
-    rows = [
-        [*s["position"][0, -1, :2], a, s["speed"][0, 0], s["steering"][0, 0]] for s, a in zip(states, yaw, strict=True)
-    ]
+    rows = [[*s["position"][0, -1, :2], a, s["speed"][0, 0], s["turn"][0, 0]] for s, a in zip(states, yaw, strict=True)]
     return np.array(rows, dtype=float)
 
 
@@ -169,13 +167,13 @@ def test_latency_holds_the_last_action(latency_ticks: int) -> None:
     made = driven({"latency": latency_ticks / 60}, speed=0.5)
     world = start(made)
     command(world, [1.0, 1.0])
-    steering = [s["steering"][0, 0] for s in run_within_decision(world, 6)]
+    steering = [s["turn"][0, 0] for s in run_within_decision(world, 6)]
     assert_allclose(steering[:latency_ticks], 0.0)
     assert (np.diff(steering[max(0, latency_ticks - 1) :]) > 0).all()
     if latency_ticks == 6:  # a whole decision: the next one acts as this one would have
         command(world, [-1.0, -1.0])
         world.advance(6)
-        assert world.get_state()["steering"][0, 0] > 0.1
+        assert world.get_state()["turn"][0, 0] > 0.1
 
 
 @pytest.mark.parametrize(("dead_band", "moves"), [(0.0, True), (0.2, True), (0.31, False)])

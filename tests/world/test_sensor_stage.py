@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from coopenv.api.engine import Engine
+from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import CoopenvError, ScenarioError
 from coopenv.measurements.kinds import KINDS, Kind, Placed
 from coopenv.measurements.sensor import kept_kind
@@ -60,7 +62,7 @@ def places(world: SimulatedWorld, i: int, target: int, sensor: dict[str, Any]) -
     return moved(L + i, sensor["position"], mounted), moved(target, marker, np.eye(3))
 
 
-@pytest.mark.parametrize("kind", [*KINDS, DOPPLER])
+@pytest.mark.parametrize("kind", [*KINDS, DOPPLER, f"{DOPPLER}InWarp"])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_sensor_without_noise_measures_what_its_kind_predicts(kind: str, dtype: str) -> None:
     sensor = {"kind": kind, "name": "own", "towards": ["landmarks", "vehicles"], **MOUNTING}
@@ -191,6 +193,17 @@ def test_cameras_see_neither_anchors_nor_anything_without_a_camera() -> None:
         assert_array_equal(world.sensed(0, 0).visible[0], seen)
 
 
+def test_maps_expect_neither_anchors_nor_anything_without_a_camera() -> None:
+    for camera, seen in (({}, 3), ({"model": "none"}, 0)):
+        description = sensing(
+            vehicles=[vehicle()], landmarks=MARKS, camera=camera, observation={"include": ["map"], "map_size": 4}
+        )
+        engine = Engine(description, 1, "float64")
+        engine.reset([0])
+        field = observation_layout(description)["map_in_view"]
+        assert field.values(engine.view("observation")[0, 0]).sum() == seen
+
+
 def test_ideal_sensing_measures_everything_and_blind_sensing_nothing() -> None:
     sensor = {
         "kind": "range",
@@ -212,18 +225,20 @@ def test_a_building_above_hides_the_sky_from_a_receiver_alone() -> None:
     assert found == {"position": False, "through": True, "attitude": True}
 
 
+OF_SENSORS = ("reading", "sensor_", "information", "gramian")
+"""Beginnings of the names of the state's fields that sensors write, or that hold their information."""
+
+
 def test_draws_of_worlds_stay_bit_for_bit_with_and_without_sensors() -> None:
     sensors = [{"kind": kind} for kind in KINDS]
     with_them, without = (world_of(sensing(*found), range(2)) for found in (sensors, []))
-    for name, values in with_them.get_state().items():
-        if not name.startswith(("reading", "sensor_")):
-            assert same_bits(values, without.get_state()[name]), name
-    for world in (with_them, without):
-        world.advance(6)
-        world.advance(6)
-    for name, values in with_them.get_state().items():
-        if not name.startswith(("reading", "sensor_")):
-            assert same_bits(values, without.get_state()[name]), name
+    for _ in range(3):
+        expected = without.get_state()
+        for name, values in with_them.get_state().items():
+            if not name.startswith(OF_SENSORS):
+                assert same_bits(values, expected[name]), name
+        for world in (with_them, without):
+            world.advance(6)
 
 
 def test_a_batch_measures_bit_for_bit_what_single_worlds_measure() -> None:
@@ -289,3 +304,29 @@ def test_a_limit_of_nearby_targets_is_refused_with_sensors() -> None:
     topology = {"mode": "sensed", "most_nearby": 3}
     with pytest.raises(ScenarioError, match=r"topology\.most_nearby: not with \[\[sensors\]\]"):
         sensing({"kind": "range"}, topology=topology)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_gramian_has_the_information_of_every_kind(kind: str) -> None:
+    """By differences of the kind's prediction in NumPy, in the error (phi, d) of the map about its origin."""
+    sensor = {"kind": kind, "name": "own", "towards": ["landmarks"], "noise": 0.05, **MOUNTING}
+    exact = {"initial_estimate": {"orientation_angle": 0.0, "position_radius": 0.0}}
+    car = vehicle((1.0, -1.0, 0.5), motion=constant([0.3, 0.0, 0.0], [0.0, 0.0, 0.2]), **exact)
+    bearing = {"model": "isotropic", "scale": 0.01, "rate": 60.0}
+    noise = {"enabled": False, "bearing": bearing}
+    world = world_of(sensing(sensor, vehicles=[car], noise=noise, camera={"model": "none"}))
+    made: Kind = kept_kind(kind, "{}")
+    expected = np.zeros((6, 6))
+    for target in range(4) if made.has_target else [0]:
+        own, there = places(world, 0, target, sensor)
+        value, columns = made.predict(own, there), []
+        for axis in np.eye(6):
+            turn, shift = 1e-6 * axis[:3], 1e-6 * axis[3:]
+            R = np.eye(3) + np.cross(np.eye(3), turn)
+            moved = Placed(own.position + np.cross(turn, own.position) + shift, R @ own.rotation, own.velocity, turn)
+            columns.append(made.residual(made.predict(moved, there), value) / 1e-6)
+        H = np.stack(columns, axis=-1)
+        expected += H.T @ H * (0.01 / 0.05) ** 2
+    found = {n: world.view(f"information_{n}")[0, 0, 0] for n in ("11", "12", "22")}
+    whole = np.block([[found["11"], found["12"]], [found["12"].T, found["22"]]])
+    assert_allclose(whole, expected, atol=2e-5 * max(1.0, np.abs(expected).max()))

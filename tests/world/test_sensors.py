@@ -30,7 +30,7 @@ from tests.oracles.geometry import OPTICAL_TO_BODY_FORWARD as FORWARD
 
 WORLDS, DECISIONS = 6, 60
 OF_TRUTH_AND_RADIO = (
-    *("rotation", "position", "velocity", "speed", "steering", "ended", "collided", "odometry_scale", "gyro_bias"),
+    *("rotation", "position", "velocity", "speed", "turn", "ended", "collided", "odometry_scale", "gyro_bias"),
     *("increment_rotation", "increment_translation", "odometry_velocity", "inbox_tick", "outbox_tick"),
 )
 ERRORS = {"noise.odometry_scale": 0.03, "noise.gyro_bias": 0.01}

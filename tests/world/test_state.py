@@ -205,7 +205,7 @@ def env() -> Any:
         ("covariance", (0, 0), -np.eye(6)),
         ("bearing", (0, 0, 1), 2.0),
         ("gramian_11", (0, 0, 0, 0, 0), NAN),
-        ("steering", (0, 0), 1.7),
+        ("turn", (0, 0), 1.7),
         ("present", (0, 0), 2),
         ("parameter", (0, 0), np.inf),
         ("difficulty", (0,), 1.5),

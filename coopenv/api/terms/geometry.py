@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.api.terms.records import Ego, MapLandmark, Neighbour, Target, TruthRecord, log10, mat66
+from coopenv.motions.command import ACCELERATION, SPEED, TURN
 from coopenv.world.camera import (
     VISIBLE,
     behind_building,
@@ -15,7 +16,6 @@ from coopenv.world.camera import (
     project,
     segment_hits_box,
 )
-from coopenv.world.dynamics import ACCELERATION, SPEED, STEERING
 from coopenv.world.model import DRIVEN
 from coopenv.world.nearby import (
     ROUNDING,
@@ -176,15 +176,19 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     first = wp.float32(state.action[world, vehicle, 0])
     second = wp.float32(state.action[world, vehicle, 1])
     third = float(0.0)
-    if model.pans == 1:
+    if model.columns + model.pans > 2:
         third = wp.float32(state.action[world, vehicle, 2])
     ego.action = wp.vec3(first, second, third)
     ego.effort = wp.length_sq(ego.action)
     ego.bytes_sent = state.bytes_sent[world, vehicle]
     command = state.command[world, vehicle]
-    ego.command = wp.vec3(wp.float32(command[SPEED]), wp.float32(command[STEERING]), wp.float32(command[ACCELERATION]))
+    ego.command = wp.vec3(wp.float32(command[SPEED]), wp.float32(command[TURN]), wp.float32(command[ACCELERATION]))
     ego.pan = wp.float32(state.pan[world, vehicle])
-    ego.steering = wp.float32(state.steering[world, vehicle])
+    turning = wp.float32(state.turn[world, vehicle])
+    steers = model.dynamics[vehicle].steers == 1
+    ego.steering = wp.where(steers, turning, 0.0)
+    ego.turn_rate = wp.where(steers, 0.0, turning)
+    ego.lateral_speed = wp.float32(state.lateral_speed[world, vehicle])
     ego.time_left = 1.0 - wp.float32(tick) / wp.float32(model.horizon_ticks)
     if route and route_length(state, world, vehicle) > p.dtype(0.0):
         turn, left, ahead = route_from_estimate(model, state, world, vehicle, s, along)
@@ -307,6 +311,8 @@ def expected_in_view(model: Any, state: Any, world: int, vehicle: int, point: An
 
     It is in range, in the image, and occluded by no building and no vehicle at the pose of its last message.
     """
+    if model.camera[vehicle].absent == 1:
+        return False
     if model.sensed == 0:
         return True
     R = state.estimate_rotation[world, vehicle]
@@ -385,7 +391,8 @@ def next_landmark(model: Any, state: Any, world: int, vehicle: int, last: MapLan
         point = mapped_position(model, state, world, vehicle, landmark.index)
         landmark.exists = True
         landmark.position = wp.vec3(wp.transpose(R) * point - state.estimate_position[world, vehicle])
-        landmark.expected = expected_in_view(model, state, world, vehicle, point)
+        if model.scene.anchor[landmark.index] == 0:
+            landmark.expected = expected_in_view(model, state, world, vehicle, point)
         entry = entry_of(model, state, world, vehicle, landmark.index)
         if entry >= 0:
             landmark.in_view = state.sight[world, vehicle, entry] == VISIBLE

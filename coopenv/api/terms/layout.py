@@ -10,6 +10,7 @@ import numpy as np
 
 from coopenv.api.terms.readings import reading_fields
 from coopenv.base.errors import CoopenvError, check_one_of, listed
+from coopenv.motions.table import MOTIONS, columns_of
 from coopenv.scenario import Scenario
 from coopenv.scenario.dynamics import Dynamics
 from coopenv.scenario.terms import GROUPS, OBSERVATION_FIELDS, READINGS, SETTINGS, SETTINGS_OF_ACTIONS, ObservationField
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from gymnasium import spaces
 
 
+COLUMNS_OBSERVED = {name for kind in MOTIONS.values() for name, _, _ in kind.columns} - {"speed"}
+"""Columns of commands whose present value is a field of the observation, of the same name."""
 RADIO = "radio_"
 """Beginning of the names of an action's entries for the radio; a number follows, that of the other vehicle."""
 
@@ -67,11 +70,11 @@ class Layout(dict[str, Field]):
     def __init__(self, fields: Mapping[str, Field], actions: tuple[tuple[ActionField, ...], ...]) -> None:
         super().__init__(fields)
         self.actions = actions
-        """Per vehicle, whose limits they span; all have the same names and units."""
+        """Per vehicle, whose limits they span; vehicles with the same kind of motion have the same names and units."""
 
     @property
     def action(self) -> tuple[ActionField, ...]:
-        """The fields of the first vehicle's action, and of any other's that has the same limits."""
+        """The fields of the first vehicle's action, and of any other's that has the same drive and limits."""
         return self.actions[0]
 
     @property
@@ -117,7 +120,9 @@ def included_fields(scenario: Scenario) -> dict[str, ObservationField]:
 def entries_of(row: ObservationField, scenario: Scenario) -> tuple[int, ...]:
     """Return the entries of a field's value that a scenario's observation holds."""
     if row is OBSERVATION_FIELDS.built_in["last_action"]:
-        return tuple(range(2 if scenario.action.pan is None else 3))
+        return tuple(range(min(row.size, scenario.columns + (scenario.action.pan is not None))))
+    if row.scale in COLUMNS_OBSERVED and not _spans(scenario, str(row.scale)):
+        return ()
     if scenario.observation.planar and row.planar is not None:
         return row.planar
     return tuple(range(row.size))
@@ -155,33 +160,46 @@ def observation_layout(scenario: Scenario) -> Layout:
     if start == 0:
         groups = listed(observation.include)
         raise CoopenvError(f"observation.include: {groups} without an entry here; add a group such as 'estimate'")
-    return Layout(layout, tuple(action_fields(scenario, limits) for limits in scenario.limits))
+    every = scenario.limits
+    actions = {key: action_fields(scenario, limits) for key, limits in {id(each): each for each in every}.items()}
+    return Layout(layout, tuple(actions[id(limits)] for limits in every))
 
 
 def _scale(row: ObservationField, scenario: Scenario) -> float:
     if row.scale == "targets":
         return float(scenario.topology.most_nearby or len(scenario.target_names))
-    if row.scale == "steering":
-        return float(max(scenario.action.steering or limits.max_steering for limits in scenario.limits))
+    if row.scale in COLUMNS_OBSERVED:
+        return float(max(_spans(scenario, str(row.scale)), default=1.0))
     if row.scale == "pan":
         return 1.0 if scenario.action.pan is None else scenario.action.pan.limit
     return float(getattr(scenario.observation, row.scale) if isinstance(row.scale, str) else row.scale)
 
 
-def action_fields(scenario: Scenario, limits: Dynamics | None = None) -> tuple[ActionField, ...]:
-    """Return the meaning of an action's entries: speed or acceleration, steering (positive turns left), pan and radio.
+def _spans(scenario: Scenario, name: str) -> list[float]:
+    """Return what an entry of 1 asks of a column of commands, for each of the vehicles whose drives have the column."""
+    every = {id(limits): limits for limits in scenario.limits}  # vehicles share the sections of the scenario
+    columns = (column for limits in every.values() for column in columns_of(limits))
+    return [scenario.action.at_one(column) for column in columns if column.name == name]
 
-    `limits` are a vehicle's; None: the first one's.
+
+def action_fields(scenario: Scenario, limits: Dynamics | None = None) -> tuple[ActionField, ...]:
+    """Return the meaning of an action's entries: the columns of the vehicle's drive, then pan and radio.
+
+    The first is a speed or acceleration, the second turns the vehicle (positive: left). Where other vehicles' drives
+    have more columns, further entries are named `unused`. `limits` are a vehicle's; None: the first one's.
     """
     limits = limits or scenario.limits[0]
-    steering = scenario.action.steering or limits.max_steering
-    if scenario.action.longitudinal == "acceleration":
-        first = ActionField("acceleration", "m/s^2", -limits.max_acceleration, limits.max_acceleration)
+    first, *turns = columns_of(limits)
+    if scenario.action.longitudinal == "acceleration" and first.name == "speed":
+        entries = [ActionField("acceleration", "m/s^2", -limits.max_acceleration, limits.max_acceleration)]
     else:
-        first = ActionField("speed", "m/s", -limits.max_speed if limits.reverse else 0.0, limits.max_speed)
-    entries: tuple[ActionField, ...] = first, ActionField("steering", "rad", -steering, steering)
+        entries = [ActionField(first.name, first.unit, first.low, first.high)]
+    for column in turns:
+        high = scenario.action.at_one(column)
+        entries.append(ActionField(column.name, column.unit, max(column.low, -high), high))
+    entries += [ActionField("unused", "1", -1.0, 1.0)] * (scenario.columns - len(entries))
     if (pan := scenario.action.pan) is not None:
-        entries = (*entries, ActionField("pan", "rad", -pan.limit, pan.limit))
+        entries.append(ActionField("pan", "rad", -pan.limit, pan.limit))
     others = len(scenario.vehicles) - 1 if scenario.action.radio else 0
     return (*entries, *(ActionField(f"{RADIO}{n + 1}", "1", -1.0, 1.0) for n in range(others)))
 
@@ -221,7 +239,7 @@ def observation_space(layout: Layout, kind: str = "flat") -> spaces.Space[Any]:
 
 
 def action_space(scenario: Scenario) -> spaces.Box:
-    """Return the action: speed or acceleration, steering (positive: left), pan and radio if any, each in [-1, 1]."""
+    """Return the action: what the drive commands, such as speed and steering, pan and radio if any, in [-1, 1]."""
     from gymnasium import spaces
 
     return spaces.Box(-1.0, 1.0, shape=(scenario.action_size,), dtype=np.float32)

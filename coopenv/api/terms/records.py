@@ -56,11 +56,13 @@ class Ego:
     velocity: wp.vec3  # m/s, last odometry sample, body
     angular_velocity: wp.vec3  # rad/s, last odometry sample, body
     odometry_age: wp.float32  # s
-    action: wp.vec3  # of this decision, [-1, 1]; the third entry is 0 where cameras do not pan
+    action: wp.vec3  # first entries of this decision, [-1, 1]: of the drive, then the camera's; 0 beyond
     effort: wp.float32  # |action|^2, without the radio's entries
     bytes_sent: wp.int32  # in this decision
-    command: wp.vec3  # the action as speed m/s, steering rad, acceleration m/s^2
-    steering: wp.float32  # rad, positive to the left
+    command: wp.vec3  # the action as speed m/s, steering rad or turn rate rad/s, acceleration m/s^2
+    steering: wp.float32  # rad, positive to the left; 0 of a drive without steering
+    turn_rate: wp.float32  # rad/s, positive to the left; of a drive without steering
+    lateral_speed: wp.float32  # m/s, to the left; of an omnidirectional drive
     pan: wp.float32  # of the camera, rad, positive to the left
     time_left: wp.float32  # share of the horizon
     route_offset: wp.float32  # m to the left of its route, by the estimate
@@ -236,6 +238,8 @@ def vehicle_values(ego: Ego) -> VehicleValues:
     values[FieldPlace.route_left] = ego.route_left
     values = put(values, FieldPlace.route_ahead, ego.route_ahead)
     values[FieldPlace.steering] = ego.steering
+    values[FieldPlace.turn_rate] = ego.turn_rate
+    values[FieldPlace.lateral_speed] = ego.lateral_speed
     values = put(values, FieldPlace.last_action, ego.action)
     values[FieldPlace.time_left] = ego.time_left
     values[FieldPlace.camera_pan] = ego.pan

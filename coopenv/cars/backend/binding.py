@@ -82,6 +82,8 @@ def bind(
         )
     for i in [i for i, vehicle in enumerate(scenario.vehicles) if not vehicle.connected][:1]:
         raise CoopenvError(f"{where}: vehicles.{i}.connected: must be true, cars send their estimates")
+    for limits in [limits for limits in scenario.limits if limits.model != "bicycle"][:1]:
+        raise CoopenvError(f"{where}: dynamics.model: must be 'bicycle', cars take steering; got {shown(limits.model)}")
     left = [name for name in vehicles if name not in {car.vehicle for car in driven}]
     targets = {number: _index(landmarks, name, f"{where}: markers") for name, number in markers.items()}
     chosen, led = {}, {}

@@ -18,7 +18,7 @@ from coopenv.base.errors import DataError
 from coopenv.cars.calibration.batch import LEAST_PLACE, LOSS, Kind, by_stretch, deviation, standard_errors
 from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import Mask
-from coopenv.world.dynamics import follow_commands
+from coopenv.motions.command import follow_commands
 from coopenv.world.launch import kernel, launch, start_warp
 
 GRID = 0.01  # s, longest step of the model

@@ -92,14 +92,15 @@ class CarWorld(World):
         self.view("present")[0, L:] = 0
         self.view("present")[0, self.agent] = 1
         self.view("ended")[0] = 0
-        for name in ("speed", "steering", "velocity", "angular_velocity"):
+        for name in ("speed", "turn", "velocity", "angular_velocity"):
             self.view(name)[0] = 0.0
 
     def drive(self, duration: float, speed: float, steering: float, deceleration: float | None = None) -> None:
         """Move by the bicycle under a command, m/s and rad, for a while, s; slow down by a deceleration, m/s^2."""
         self._time_value[0] = duration
         slower = deceleration is not None and abs(speed) < abs(self.view("speed")[0, self.vehicle])
-        self.view("command")[0, self.vehicle] = (speed, steering, deceleration if slower else self._acceleration, 0.0)
+        most = deceleration if slower else self._acceleration
+        self.view("command")[0, self.vehicle] = (speed, steering, most, 0.0, 0.0)
         self._run("drive", drive_one, PerWorld(self._time), self.vehicle)
 
     def follow(self, time: float) -> None:

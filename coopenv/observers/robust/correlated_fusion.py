@@ -38,8 +38,7 @@ from coopenv.observers.robust.joint_state import (
 from coopenv.observers.robust.measurements import is_received
 from coopenv.observers.robust.memory import Member, Pose, PoseEstimate, mat66d, vec6d
 from coopenv.observers.robust.messages import bit_of, depends_on_own, includes, propagate_member
-from coopenv.observers.robust.sources import clear_drift, clear_source, is_excluded, take_slot
-from coopenv.world.camera import VISIBLE
+from coopenv.observers.robust.sources import clear_drift, clear_source, is_excluded, is_seen, take_slot
 from coopenv.world.nearby import box_of, box_of_entry, entry_at, entry_count, sender_of
 from coopenv.world.warp_internals import device_function, subroutine
 
@@ -293,7 +292,8 @@ def next_new_sender(model: Any, state: Any, memory: Any, world: int, i: int, las
     for n in range(entry_count(model, state, world, i)):
         entry = entry_at(model, state, kept, world, i, n)
         box = box_of_entry(model, entry)
-        if state.sight[world, i, entry] == VISIBLE and is_received(model, state, memory, world, i, box, tick):
+        seen = is_seen(memory, state, world, i, entry, tick)
+        if seen and is_received(model, state, memory, world, i, box, tick):
             sender = sender_of(model, state, world, i, box)
             if index_of(memory, world, i, sender) == 0:
                 at = rank(model, sender, memory.inbox[world, i, box])

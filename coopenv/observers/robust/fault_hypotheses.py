@@ -15,7 +15,7 @@ from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.integrity import end_block, restart_fault
 from coopenv.observers.robust.joint_state import begin_calibration, insert_member, mounting_of, remove_member, set_block
-from coopenv.observers.robust.measurements import innovation_weight
+from coopenv.observers.robust.linearisation import innovation_weight
 from coopenv.observers.robust.memory import (
     ERRORS,
     FOCAL_ERROR,

@@ -39,8 +39,7 @@ from coopenv.observers.robust.memory import (
     vec4d,
     vec6d,
 )
-from coopenv.observers.robust.sources import VELOCITY, propagate_sources
-from coopenv.world.camera import VISIBLE
+from coopenv.observers.robust.sources import VELOCITY, is_seen, propagate_sources
 from coopenv.world.nearby import agent_of, entry_at, entry_count
 from coopenv.world.warp_internals import device_function, subroutine
 
@@ -170,7 +169,7 @@ def mark_seen(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
     for n in range(entry_count(model, state, world, i)):
         entry = entry_at(model, state, kept, world, i, n)
         target = agent_of(state, kept, world, i, entry)
-        if target >= model.landmarks and state.sight[world, i, entry] == VISIBLE:
+        if target >= model.landmarks and is_seen(memory, state, world, i, entry, tick):
             member = index_of(memory, world, i, target - model.landmarks)
             if member > 0:
                 memory.member[world, i, member].seen_tick = tick

@@ -12,6 +12,7 @@ import warp as wp
 from coopenv.base.sections import LARGEST
 from coopenv.estimation.validity import are_covariances
 from coopenv.observers.robust.constants import MAX_CORRELATIONS, MAX_HYPOTHESES, MAX_MEMBERS, STEPS
+from coopenv.world.embedded import Nothing
 from coopenv.world.state import COVARIANCE, FLAG, LEAST_EIGENVALUE, ROTATION, TICK, Rule, array, numbers, whole
 from coopenv.world.warp_internals import device_function
 
@@ -189,8 +190,24 @@ class BearingMeasurement:
 
 
 @wp.struct
+class Reading:
+    """The rest of a measurement of a sensor beside the camera, two of its rows at most; scratch, see readings.py."""
+
+    part: wp.int32  # which pair of its rows, from 0 on; -1: it is a bearing of the camera
+    used: wp.int32  # how many of these rows it has
+    kind: wp.int32  # its place in the table of kinds
+    rotation: mat33d  # sensor to body
+    place: vec3d  # m, of the sensor in the body
+    value: vec6d
+    std: vec6d  # of the rows
+    turn: mat33d  # orientation of the target, on the map or in the member's body
+    turn_variance: wp.float64  # rad^2 per axis, of that
+    period: wp.float64  # s, since the sensor's last measurements
+
+
+@wp.struct
 class Derivative:
-    """The derivative of a bearing by the error of a member."""
+    """The derivative of a measurement by the error of a member."""
 
     member: wp.int32  # -1: none
     jacobian: mat26d
@@ -226,40 +243,59 @@ class Regressor:
     coefficient: mat66d
 
 
-@wp.struct
-class RobustMemory:
-    """The memory of a world's observers.
+def memory_struct(entries: str, of_reading: Any) -> Any:
+    """Return the Warp struct of the memory.
 
-    K members of a belief (the vehicle itself first), H hypotheses, J errors that a bearing depends on, C correlations
-    of a message, Q sources; other axes as in `coopenv.world.state`. Arrays with lanes (L) are scratch.
+    Functions that differ for worlds with sensors beside the camera are overloads for both structs (readings.py).
+
+    Args:
+        entries: the axis of a frame's measurements, F; or X where all of them are bearings of the camera.
+        of_reading: the struct of what a measurement of another sensor has beside; `Nothing` without any.
     """
 
-    belief: array("WN", JointBelief)
-    member: array("WNK", Member)
-    P: array("WNKK", mat66d)  # blocks of the members' joint covariance
-    anchor: array("WN", Anchor)
-    search: array("WN", Search)
-    source: array("WNQ", SourceMonitor)
-    sensitivity: array("WNQO", mat63d)  # of the own error and the calibration errors by the fault of a source
-    drift_effect: array("WNTO", vec6d)  # the errors themselves, if a sender's `drift` is a fault
-    information: array("WNQU", mat33d)  # on a fault; and on it and that of a sender, by slot
-    fault_mixture: array("WN", mat66d)  # addition of uncertain faults to the covariance of the own pose
-    effect: array("WLXQ", mat23d)  # of an innovation by the fault of a source
-    weighted_effect: array("WLXQ", mat23d)  # times the weight of the bearing
-    block_scratch: array("WLKK", mat33d)  # blocks of the covariance of senders' errors or faults
-    block_member: array("WLK", wp.int32)  # the members to which they belong
-    hypothesis: array("WNH", Hypothesis)
-    outbox: array("WNS", SenderReport)
-    inbox: array("WNY", SenderReport)  # per receiver and box
-    inbox_sender: array("WNY", wp.int32)  # sender of that report, where not all are kept; -1: none
-    measurement: array("WLX", BearingMeasurement)
-    derivative: array("WLXJ", Derivative)  # of a bearing: by the errors of oneself, target, mounting, focal length
-    scratch: array("WLK", Scratch)
-    projection: array("WLXK", mat26d)  # H P, of a bearing and a member, see correction.py
-    outbox_correlation: array("WNSC", Correlation)
-    correlation: array("WNYC", Correlation)  # per receiver and box
-    known: array("WLK", Regressor)
-    factor: array("WLKK", mat66d)  # blocks of a Cholesky factor, on its diagonal their inverses
+    @wp.struct
+    class RobustMemory:
+        """The memory of a world's observers.
+
+        K members of a belief (the vehicle itself first), H hypotheses, J errors that a measurement depends on, C
+        correlations of a message, Q sources; other axes as in `coopenv.world.state`. Arrays with lanes (L) are scratch.
+        """
+
+        belief: array("WN", JointBelief)
+        member: array("WNK", Member)
+        P: array("WNKK", mat66d)  # blocks of the members' joint covariance
+        anchor: array("WN", Anchor)
+        search: array("WN", Search)
+        source: array("WNQ", SourceMonitor)
+        sensitivity: array("WNQO", mat63d)  # of the own error and the calibration errors by the fault of a source
+        drift_effect: array("WNTO", vec6d)  # the errors themselves, if a sender's `drift` is a fault
+        information: array("WNQU", mat33d)  # on a fault; and on it and that of a sender, by slot
+        fault_mixture: array("WN", mat66d)  # addition of uncertain faults to the covariance of the own pose
+        effect: array("WL" + entries + "Q", mat23d)  # of an innovation by the fault of a source
+        weighted_effect: array("WL" + entries + "Q", mat23d)  # times the weight of the bearing
+        block_scratch: array("WLKK", mat33d)  # blocks of the covariance of senders' errors or faults
+        block_member: array("WLK", wp.int32)  # the members to which they belong
+        hypothesis: array("WNH", Hypothesis)
+        outbox: array("WNS", SenderReport)
+        inbox: array("WNY", SenderReport)  # per receiver and box
+        inbox_sender: array("WNY", wp.int32)  # sender of that report, where not all are kept; -1: none
+        measurement: array("WL" + entries, BearingMeasurement)
+        derivative: array(
+            "WL" + entries + "J", Derivative
+        )  # of a bearing: by the errors of oneself, target, mounting, focal length
+        scratch: array("WLK", Scratch)
+        projection: array("WL" + entries + "K", mat26d)  # H P, of a bearing and a member, see correction.py
+        outbox_correlation: array("WNSC", Correlation)
+        correlation: array("WNYC", Correlation)  # per receiver and box
+        known: array("WLK", Regressor)
+        reading: array("WL" + entries, of_reading)  # of measurements of sensors beside the camera, see readings.py
+        reading_tick: array("WNR", wp.int32)  # of the last frame with measurements of a sensor; -1: none
+        factor: array("WLKK", mat66d)  # blocks of a Cholesky factor, on its diagonal their inverses
+
+    return RobustMemory
+
+
+RobustMemory, RobustMemoryWithReadings = memory_struct("X", Nothing), memory_struct("F", Reading)
 
 
 ERRORS = 1  # the member that stands for the errors of odometry and of the focal length, see joint_state.py
@@ -308,6 +344,7 @@ def clear(memory: Any, world: int, i: int):
     never.tick = -1
     fill(memory.inbox[world, i], never)
     fill(memory.inbox_sender[world, i], -1)
+    fill(memory.reading_tick[world, i], -1)
 
 
 LARGE = numbers(LARGEST**3)
@@ -351,7 +388,7 @@ def robust_rules() -> dict[str, Rule]:
         "member.correlation_unknown member.report.valid belief.gate_disabled outbox.carries_correlations "
         "inbox.carries_correlations member.report.carries_correlations"
     )
-    ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick source.seen_tick"
+    ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick source.seen_tick reading_tick"
     large = (
         "hypothesis.cost hypothesis.misfit hypothesis.prior_distance fault_mixture sensitivity information "
         "drift_effect source.drift source.drift_vector source.drift_information source.drift_ratio source.drift_time "

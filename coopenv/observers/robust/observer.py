@@ -11,8 +11,10 @@ that of the solution, members' errors included: G (N + H_o P_o H_o^T) G^T with G
 cross-covariances become -G H_o P_o.
 """
 
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from coopenv.base.errors import CoopenvError
@@ -52,13 +54,15 @@ from coopenv.observers.robust.joint_state import (
     take_odometry,
     walk_errors,
 )
-from coopenv.observers.robust.measurements import RESECTION, TRACKING, innovation_squared, set_bearing_measurements
+from coopenv.observers.robust.linearisation import innovation_squared
+from coopenv.observers.robust.measurements import RESECTION, TRACKING, set_bearing_measurements
 from coopenv.observers.robust.memory import (
     ROBUST_SIZES,
     BearingFrame,
     Pose,
     PoseEstimate,
     RobustMemory,
+    RobustMemoryWithReadings,
     clear,
     mat33d,
     mat66d,
@@ -68,6 +72,7 @@ from coopenv.observers.robust.memory import (
     vec6d,
 )
 from coopenv.observers.robust.messages import ROBUST_MESSAGES, bit_of
+from coopenv.observers.robust.readings import NAMES, add_readings, unused_rows
 from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
 from coopenv.observers.robust.sources import begin_sources, is_excluded
 from coopenv.world.embedded import Embedded
@@ -171,7 +176,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
     """Correct the belief by the bearings of a frame that pass the gate, and test all sources."""
     share, fitting, nis = gate(frame, memory, world, i)
     state.nis[world, i] = nis
-    state.nis_dof[world, i] = 2 * fitting
+    state.nis_dof[world, i] = 2 * fitting - unused_rows(memory, world, i, frame.bearings)
     if share >= wp.float64(0.0):  # rejected bearings show faults
         iterated_update(frame, memory, world, i)
         correct_sources(frame, memory, world, i)
@@ -370,6 +375,7 @@ def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
         found = memory.search[world, i].active == 1
         frame = set_bearing_measurements(model, state, memory, world, i, now, wp.where(found, RESECTION, TRACKING))
         if not found:
+            frame.bearings = add_readings(memory, model, state, world, i, frame)
             update(model, state, memory, world, i, now, frame)
         else:
             determined = resect(frame, memory, world, i)
@@ -393,6 +399,15 @@ def conclude(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
 OPTIONS = {"max_unroll": 1}
 """Options of the Warp module. Unrolled loops make long code, which compiles slowly and runs no faster."""
 
+
+def fitted(model: Any) -> Embedded:
+    """Return the variant for the sensors of a model. Raises CoopenvError: it cannot take one of them."""
+    kinds = model.sensor.numpy()["kind"] if model.sensor.shape[0] else np.zeros(0)
+    if (kinds < 0).any():
+        raise CoopenvError(f"observer 'robust' takes the kinds {', '.join(NAMES)}, and no class of one's own")
+    return WITH_READINGS if len(kinds) else ROBUST
+
+
 ROBUST = Embedded(
     "robust",
     (propagate_belief, search, fuse, correct, conclude),
@@ -400,11 +415,14 @@ ROBUST = Embedded(
     send_broadcast,
     RobustMemory,
     ROBUST_SIZES,
+    fitted,
     valid=robust_rules(),
     messages=ROBUST_MESSAGES,
     coordinates=Coordinates.LEFT,
     options=OPTIONS,
 )
+WITH_READINGS = replace(ROBUST, name="robust_with_readings", memory=RobustMemoryWithReadings)
+"""Variant for worlds with sensors beside the camera."""
 
 
 def robust(setup: Setup) -> Observer:

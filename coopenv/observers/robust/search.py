@@ -19,15 +19,8 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import carried, distance_squared, inverse6, is_known, is_regular
 from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.joint_state import begin_belief, own_estimate
-from coopenv.observers.robust.measurements import (
-    SEARCH,
-    frames_in,
-    innovation_squared,
-    innovation_with,
-    linearise,
-    set_bearing_measurements,
-    tangent_basis,
-)
+from coopenv.observers.robust.linearisation import innovation_squared, innovation_with, linearise, tangent_basis
+from coopenv.observers.robust.measurements import SEARCH, frames_in, set_bearing_measurements
 from coopenv.observers.robust.memory import BearingFrame, Hypothesis, Pose, PoseEstimate, Search, mat33d, mat66d
 from coopenv.world.warp_internals import device_function, subroutine
 

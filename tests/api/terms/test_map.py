@@ -175,7 +175,7 @@ def test_the_route_is_relative_to_the_own_estimate() -> None:
 def test_own_state_and_sightings_are_observed() -> None:
     scenario = scenario_with(map_size=1)
     engine = driven(scenario, steps=40)
-    np.testing.assert_allclose(seen(engine, scenario, "steering")[..., 0], engine.view("steering"), atol=1e-5)
+    np.testing.assert_allclose(seen(engine, scenario, "steering")[..., 0], engine.view("turn"), atol=1e-5)
     np.testing.assert_allclose(seen(engine, scenario, "last_action"), engine.view("action"), atol=1e-6)
     np.testing.assert_allclose(seen(engine, scenario, "time_left"), 1.0 - 4.0 / 40.0, atol=1e-6)
     L = len(scenario.landmarks)

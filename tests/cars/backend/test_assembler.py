@@ -359,6 +359,11 @@ def test_a_vehicle_without_a_radio_is_refused() -> None:
         bind(scenario([vehicle(connected=False)]), [Car(name="a")], {}, "lab.toml", None)
 
 
+def test_cars_take_steering_not_turn_rates() -> None:
+    with pytest.raises(CoopenvError, match=r"^lab\.toml: dynamics\.model: must be 'bicycle', cars take steering; got"):
+        bind(scenario([vehicle()], dynamics={"model": "differential_drive"}), [Car(name="a")], {}, "lab.toml", None)
+
+
 def test_a_camera_without_calibration_is_refused() -> None:
     with pytest.raises(CoopenvError, match="the camera of vehicle_1 has no calibration"):
         binding(camera={"model": "omnidirectional"})

@@ -242,20 +242,29 @@ def scenario(**more: Any) -> Scenario:
     return coopenv.load_scenario(FOUR_WAY, {**SMOOTH, **more})
 
 
-@pytest.fixture(scope="module", params=["speed", pytest.param("acceleration", marks=pytest.mark.slow)])
+KINDS = {
+    "speed": {},
+    "omnidirectional": {"dynamics.model": "omnidirectional"},
+    "acceleration": {"action.longitudinal": "acceleration"},
+}
+
+
+@pytest.fixture(
+    scope="module", params=["speed", *(pytest.param(name, marks=pytest.mark.slow) for name in [*KINDS][1:])]
+)
 def made(request: pytest.FixtureRequest) -> Scenario:
-    return scenario(**{"action.longitudinal": request.param})
+    return scenario(**KINDS[request.param])
 
 
-def commands(seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(-0.6, 0.6, (DECISIONS, WORLDS, 4, 2))
+def commands(made: Scenario, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-0.6, 0.6, (DECISIONS, WORLDS, 4, made.columns))
 
 
 def test_forward_equals_the_world(made: Scenario) -> None:
-    rollout = DifferentiableWorld(made, WORLDS).rollout(commands(), SEED)
+    rollout = DifferentiableWorld(made, WORLDS).rollout(commands(made), SEED)
     world = simulate(made, WORLDS)
     world.reset(world_keys(SEED, WORLDS))
-    for command in commands():
+    for command in commands(made):
         world.actions.assign(command)
         world.advance(made.ticks_per_decision)
     L = len(made.landmarks)
@@ -268,7 +277,7 @@ def test_forward_equals_the_world(made: Scenario) -> None:
 
 def test_gradient_equals_finite_differences(made: Scenario) -> None:
     differentiable = DifferentiableWorld(made, WORLDS)
-    base = commands()
+    base = commands(made)
     gradient = differentiable.rollout(base, SEED).gradient
     assert gradient.shape == base.shape and np.abs(gradient).max() > 1e-4
     rng = np.random.default_rng(5)
@@ -281,7 +290,7 @@ def test_gradient_equals_finite_differences(made: Scenario) -> None:
 
 def test_descent_lowers_the_uncertainty(made: Scenario) -> None:
     differentiable = DifferentiableWorld(made, WORLDS)
-    base = commands(1)
+    base = commands(made, 1)
     first = differentiable.rollout(base, SEED)
     direction = first.gradient / np.abs(first.gradient).max()
     assert differentiable.rollout(base - 0.05 * direction, SEED).uncertainty < first.uncertainty
@@ -308,6 +317,7 @@ def test_intervals_cover_a_tick_and_take_every_sample(camera: float, odometry: f
         {"camera.quantise": True},
         {"rates.observer": 30.0},
         {"vehicles.0.motion": {"kind": "static"}},
+        {"dynamics.model": "tests.helpers.builders:vehicle"},
     ],
 )
 def test_scenarios_without_a_derivative_are_refused(change: dict[str, Any]) -> None:

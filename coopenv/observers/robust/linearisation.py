@@ -1,0 +1,142 @@
+"""Measurements of a frame linearised at the current estimates, and their innovations."""
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.estimation.linalg import skew
+from coopenv.observers.robust.algebra import by_rows
+from coopenv.observers.robust.measurements import linearisation_variance
+from coopenv.observers.robust.memory import FOCAL_ERROR, BearingFrame, Derivative, Pose, mat26d, vec3d
+from coopenv.observers.robust.readings import is_reading, linearise_reading
+from coopenv.world.warp_internals import device_function, subroutine
+
+
+@wp.func
+def tangent_basis(b: Any):
+    """Return two orthonormal rows across a unit vector (Duff et al., JCGT 6(1), 2017)."""
+    one = wp.float64(1.0)
+    sign = wp.where(b[2] < wp.float64(0.0), -one, one)
+    a = -one / (sign + b[2])
+    c = b[0] * b[1] * a
+    x = vec3d(one + sign * b[0] * b[0] * a, sign * c, -sign * b[0])
+    return wp.matrix_from_rows(x, vec3d(c, sign + b[1] * b[1] * a, -b[1]))
+
+
+@subroutine
+def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
+    """Linearise the n-th bearing, residual = H x + noise; return whether its target is ahead of the camera."""
+    if is_reading(memory, world, i, n):
+        return linearise_reading(memory, world, i, n)
+    member = memory.measurement[world, i, n].member
+    point = memory.measurement[world, i, n].point
+    bearing = memory.measurement[world, i, n].bearing
+    own = memory.member[world, i, 0].pose
+    z = point
+    turn = wp.identity(3, wp.float64)
+    if member > 0:
+        theirs = memory.member[world, i, member].pose
+        z = theirs.p + theirs.R * point
+        turn = wp.transpose(own.R) * theirs.R
+    a = wp.transpose(own.R) * (z - own.p)
+    d = a - frame.lever
+    mounting = Pose(wp.identity(3, wp.float64), vec3d())
+    if frame.mounting > 0:
+        mounting = memory.member[world, i, frame.mounting].pose
+        d = d - mounting.p
+    distance = wp.max(wp.length(d), wp.float64(1.0e-9))
+    inverse = wp.float64(1.0) / distance
+    u = d * inverse
+    # A relative error of the focal length moves bearings so; of the predicted one, because noise of the measured one
+    # would be in innovation and derivative alike.
+    predicted = wp.transpose(mounting.R) * u
+    cosine = wp.dot(frame.axis, predicted)
+    away = cosine * (cosine * predicted - frame.axis)
+    if frame.focal > 0:
+        bearing = wp.normalize(bearing - memory.member[world, i, frame.focal].v[1] * away)
+    bearing = mounting.R * bearing
+    T = tangent_basis(u)
+    B = T * inverse
+    H = mat26d()
+    H[:, :3] = B * skew(a)
+    H[:, 3:] = -B
+    memory.derivative[world, i, n, 0] = Derivative(0, H)
+    memory.derivative[world, i, n, 1].member = wp.where(member > 0, member, -1)
+    if member > 0:
+        G = B * turn
+        H[:, :3] = -(G * skew(point))
+        H[:, 3:] = G
+        memory.derivative[world, i, n, 1].jacobian = H
+    memory.derivative[world, i, n, 2].member = wp.where(frame.mounting > 0, frame.mounting, -1)
+    H[:, :3] = T * mounting.R * skew(memory.measurement[world, i, n].bearing)
+    H[:, 3:] = -(B * mounting.R)
+    memory.derivative[world, i, n, 2].jacobian = H
+    memory.derivative[world, i, n, 3].member = wp.where(frame.focal > 0, frame.focal, -1)
+    H = mat26d()
+    H[:, FOCAL_ERROR] = T * (mounting.R * away)
+    memory.derivative[world, i, n, 3].jacobian = H
+    memory.measurement[world, i, n].residual = T * bearing
+    memory.measurement[world, i, n].distance = distance
+    remainder = linearisation_variance(memory, world, i, member, turn, u, distance, frame.period)
+    variance = frame.variance + memory.measurement[world, i, n].variance * inverse * inverse + remainder
+    memory.measurement[world, i, n].noise = variance
+    return wp.dot(u, bearing) > wp.float64(0.0)
+
+
+@device_function
+def project(memory: Any, world: int, i: int, n: int):
+    """Set a measurement's `projection` to H P; a loop over the derivatives would be slower."""
+    H = memory.derivative[world, i, n, 0].jacobian
+    member = memory.derivative[world, i, n, 1].member
+    mounting = memory.derivative[world, i, n, 2].member
+    focal = memory.derivative[world, i, n, 3].member
+    for k in range(memory.belief[world, i].members):
+        rows = by_rows(H, memory.P[world, i, 0, k])
+        if member > 0:
+            rows = rows + by_rows(memory.derivative[world, i, n, 1].jacobian, memory.P[world, i, member, k])
+        if mounting > 0:
+            rows = rows + by_rows(memory.derivative[world, i, n, 2].jacobian, memory.P[world, i, mounting, k])
+        if focal > 0:
+            rows = rows + by_rows(memory.derivative[world, i, n, 3].jacobian, memory.P[world, i, focal, k])
+        memory.projection[world, i, n, k] = rows
+
+
+@device_function
+def innovation_cross_covariance(memory: Any, world: int, i: int, n: int, m: int):
+    """Return the covariance, 2x2, of the n-th predicted bearing with the m-th innovation, given the earlier ones."""
+    S = memory.derivative[world, i, n, 0].jacobian * wp.transpose(memory.projection[world, i, m, 0])
+    member = memory.derivative[world, i, n, 1].member
+    if member > 0:
+        S = S + memory.derivative[world, i, n, 1].jacobian * wp.transpose(memory.projection[world, i, m, member])
+    mounting = memory.derivative[world, i, n, 2].member
+    if mounting > 0:
+        S = S + memory.derivative[world, i, n, 2].jacobian * wp.transpose(memory.projection[world, i, m, mounting])
+    focal = memory.derivative[world, i, n, 3].member
+    if focal > 0:
+        S = S + memory.derivative[world, i, n, 3].jacobian * wp.transpose(memory.projection[world, i, m, focal])
+    return S
+
+
+@device_function
+def innovation_weight(memory: Any, world: int, i: int, n: int, noise: Any):
+    """Return the inverse of the innovation's covariance of a projected bearing with a noise per axis, rad^2."""
+    return wp.inverse(noise * wp.identity(2, wp.float64) + innovation_cross_covariance(memory, world, i, n, n))
+
+
+@device_function
+def innovation_with(memory: Any, world: int, i: int, n: int, noise: Any):
+    """Return the normalised innovation squared of a projected bearing with a noise per axis, rad^2."""
+    residual = memory.measurement[world, i, n].residual
+    return wp.dot(residual, innovation_weight(memory, world, i, n, noise) * residual)
+
+
+@subroutine
+def innovation_squared(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
+    """Linearise a bearing and return its normalised innovation squared, infinite for a target behind the camera.
+
+    Its `projection` is set to H P.
+    """
+    if not linearise(frame, memory, world, i, n):
+        return wp.float64(wp.inf)
+    project(memory, world, i, n)
+    return innovation_with(memory, world, i, n, memory.measurement[world, i, n].noise)

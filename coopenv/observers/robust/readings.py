@@ -1,0 +1,299 @@
+"""Measurements of sensors beside the camera: ranges, positions and the other kinds of `coopenv.measurements`.
+
+A measurement enters a frame as pairs of its rows, which are gated and fused one by one like the two rows of a bearing.
+The rows are divided by their standard deviations, so that every pair has unit noise. A row that was not measured, or
+that a pair lacks, has residual 0 and derivative 0. The noise of a row includes the error of the target's propagation
+since its report, and the variance of the linearisation error.
+
+Functions with two overloads do nothing in worlds without such sensors.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.estimation.linalg import exp_so3, skew
+from coopenv.measurements.kinds import KINDS
+from coopenv.measurements.sensor import kind_of
+from coopenv.observers.contract import MIN_BEARING_STD
+from coopenv.observers.robust import constants
+from coopenv.observers.robust.algebra import between, odometry_noise
+from coopenv.observers.robust.joint_state import index_of
+from coopenv.observers.robust.measurements import (
+    HALF_ACCELERATION,
+    frames_in,
+    is_received,
+    linearised_frames,
+    relative_spread,
+    set_bearing_measurement,
+    set_measurement_of_member,
+)
+from coopenv.observers.robust.memory import (
+    BearingFrame,
+    Derivative,
+    Reading,
+    RobustMemory,
+    RobustMemoryWithReadings,
+    mat26d,
+    mat33d,
+    vec2d,
+    vec3d,
+    vec6d,
+)
+from coopenv.observers.robust.messages import is_circular
+from coopenv.observers.robust.sources import is_excluded, take_slot
+from coopenv.world.camera import mapped_position
+from coopenv.world.model import STATIC
+from coopenv.world.nearby import box_of_entry
+from coopenv.world.warp_internals import device_function, overload_of
+
+NAMES = list(KINDS)
+BEARING, RANGE_BEARING, RELATIVE_POSE = (NAMES.index(name) for name in ("bearing", "range_bearing", "relative_pose"))
+
+
+def _rows_from(number: int) -> Any:
+    """Return the Warp function of the rows of all shipped kinds from a number on."""
+    kind_in_warp = kind_of(NAMES[number]).in_warp
+    assert kind_in_warp is not None
+    predict, residual, jacobian = kind_in_warp.predict, kind_in_warp.residual, kind_in_warp.jacobian
+    further = _rows_from(number + 1) if number + 1 < len(NAMES) else None
+
+    @device_function
+    def last(kind: int, value: Any, R: Any, p: Any, target_R: Any, target_p: Any):
+        """Return the rows of the last kind."""
+        still = p - p
+        predicted = predict(R, p, still, target_R, target_p, still, vec6d())
+        by_own, by_target = jacobian(R, p, still, target_R, target_p, still)
+        return residual(value, predicted, p), predicted, by_own, by_target
+
+    @device_function
+    def rows(kind: int, value: Any, R: Any, p: Any, target_R: Any, target_p: Any):
+        """Return residual, prediction, and derivatives by errors of the sensor and of the target."""
+        if kind == number:
+            return last(kind, value, R, p, target_R, target_p)
+        return further(kind, value, R, p, target_R, target_p)
+
+    return last if further is None else rows
+
+
+rows_of_kind = _rows_from(0)
+
+
+@device_function
+def turn_since_report(model: Any, memory: Any, world: int, i: int, n: int, frame: BearingFrame, received: bool):
+    """Set the turn of the n-th measurement's target, a member, since its last fused report; and the variance of it."""
+    member = memory.measurement[world, i, n].member
+    stands = memory.member[world, i, member].report.tick
+    turn = wp.identity(3, wp.float64)
+    if received:
+        box = memory.member[world, i, member].box
+        if memory.inbox[world, i, box].tick > stands:
+            turn = between(memory.member[world, i, member].report.odometry, memory.inbox[world, i, box].odometry).R
+            stands = memory.inbox[world, i, box].tick
+    age = wp.float64(frame.tick - stands) * model.camera_period
+    away = wp.float64(HALF_ACCELERATION) * age * age
+    memory.reading[world, i, n].turn = turn * exp_so3(memory.member[world, i, member].w * age)
+    variance = odometry_noise(model, i, age)[0] * frames_in(age, frame.period) + away * away
+    memory.reading[world, i, n].turn_variance = variance
+
+
+@device_function
+def set_target(model: Any, state: Any, memory: Any, world: int, i: int, frame: BearingFrame, target: int) -> bool:
+    """Set the target of the frame's next measurement; return whether the measurement is usable."""
+    n = frame.bearings
+    sender = target - model.landmarks
+    if sender < 0:
+        point = vec3d(mapped_position(model, state, world, i, target))
+        set_bearing_measurement(memory, world, i, n, 0, vec3d(), point, wp.float64(0.0))
+        q = take_slot(memory, world, i, target, frame.tick, True, model.camera_period)
+        memory.measurement[world, i, n].source = q
+        memory.reading[world, i, n].turn = mat33d(state.rotation[world, target])
+        if model.motion.kind[target] != STATIC:  # not known
+            memory.reading[world, i, n].turn = wp.float64(wp.nan) * wp.identity(3, wp.float64)
+        return True
+    member = index_of(memory, world, i, sender)
+    if member == 0:
+        return False
+    q = memory.member[world, i, member].source
+    if is_circular(memory, world, i, member) and not is_excluded(memory, world, i, q):
+        return False
+    received = is_received(model, state, memory, world, i, box_of_entry(model, target), frame.tick)
+    if not set_measurement_of_member(model, memory, world, i, frame, member, received, vec3d()):
+        return False
+    turn_since_report(model, memory, world, i, n, frame, received)
+    memory.measurement[world, i, n].source = q
+    memory.source[world, i, q].seen_tick = frame.tick
+    return True
+
+
+@device_function
+def set_pairs(model: Any, state: Any, memory: Any, world: int, i: int, first: int, sensor: int, entry: int) -> int:
+    """Set the pairs of rows of a measurement, of which the first has its target; return how many they are."""
+    rows = model.sensor[sensor].rows
+    pairs = (rows + 1) // 2
+    memory.reading[world, i, first].kind = model.sensor[sensor].kind
+    memory.reading[world, i, first].rotation = mat33d(model.sensor[sensor].rotation)
+    memory.reading[world, i, first].place = vec3d(model.sensor[sensor].position)
+    memory.reading[world, i, first].value = vec6d(state.reading[world, i, sensor, entry])
+    memory.reading[world, i, first].std = vec6d(model.sensor[sensor].counted)
+    for part in range(pairs):
+        n = first + part
+        memory.measurement[world, i, n] = memory.measurement[world, i, first]
+        memory.reading[world, i, n] = memory.reading[world, i, first]
+        memory.reading[world, i, n].part = part
+        memory.reading[world, i, n].used = wp.min(rows - 2 * part, 2)
+    return pairs
+
+
+@device_function
+def add_readings(memory: RobustMemory, model: Any, state: Any, world: int, i: int, frame: BearingFrame) -> int:
+    """Return the number of the frame's measurements."""
+    return frame.bearings
+
+
+@overload_of(add_readings, subroutine=True)
+def add_readings_with_sensors(
+    memory: RobustMemoryWithReadings, model: Any, state: Any, world: int, i: int, frame: BearingFrame
+) -> int:
+    """Add the measurements of other sensors to the frame's bearings; return the number of all."""
+    for n in range(frame.bearings):
+        memory.reading[world, i, n].part = -1
+    own = BearingFrame()
+    own.purpose = frame.purpose
+    own.tick = frame.tick
+    own.bearings = frame.bearings
+    for sensor in range(model.sensor.shape[0]):
+        last = memory.reading_tick[world, i, sensor]
+        own.period = frame.period
+        if last >= 0:
+            own.period = wp.float64(frame.tick - last) * model.camera_period
+        own.period = wp.clamp(own.period, frame.period, wp.max(wp.float64(constants.MEAN_TIME), frame.period))
+        entries = wp.where(model.sensor[sensor].has_target == 1, model.target_count[i], 1)
+        for k in range(wp.where(model.carries[i, sensor] == 1, entries, 0)):
+            entry = wp.where(model.sensor[sensor].has_target == 1, model.targets[i, k], 0)
+            if state.reading_tick[world, i, sensor, entry] == frame.tick:
+                memory.reading_tick[world, i, sensor] = frame.tick
+                n = own.bearings
+                memory.reading[world, i, n] = Reading()
+                memory.reading[world, i, n].period = own.period
+                usable = bool(True)
+                if model.sensor[sensor].has_target == 1:
+                    usable = set_target(model, state, memory, world, i, own, entry)
+                else:
+                    set_bearing_measurement(memory, world, i, n, 0, vec3d(), vec3d(), wp.float64(0.0))
+                    memory.reading[world, i, n].turn = wp.identity(3, wp.float64)
+                if usable:
+                    own.bearings += set_pairs(model, state, memory, world, i, n, sensor, entry)
+    return own.bearings
+
+
+@device_function
+def is_reading(memory: RobustMemory, world: int, i: int, n: Any) -> bool:
+    """Return whether a measurement is one of a sensor beside the camera."""
+    return False
+
+
+@overload_of(is_reading)
+def is_reading_with_sensors(memory: RobustMemoryWithReadings, world: int, i: int, n: Any) -> bool:
+    """Return whether a measurement is one of a sensor beside the camera."""
+    return memory.reading[world, i, n].part >= 0
+
+
+@device_function
+def unused_rows(memory: RobustMemory, world: int, i: int, count: Any) -> int:
+    """Return how many rows of the measurements that fit were not measured."""
+    return 0
+
+
+@overload_of(unused_rows)
+def unused_rows_with_sensors(memory: RobustMemoryWithReadings, world: int, i: int, count: Any) -> int:
+    """Return how many rows of the measurements that fit were not measured."""
+    unused = int(0)
+    for n in range(count):
+        if memory.reading[world, i, n].part >= 0 and memory.measurement[world, i, n].fits == 1:
+            unused += 2 - memory.reading[world, i, n].used
+    return unused
+
+
+@device_function
+def linearise_reading(memory: RobustMemory, world: int, i: int, n: Any) -> bool:
+    """Return whether its target is ahead."""
+    return False
+
+
+@overload_of(linearise_reading, subroutine=True)
+def linearise_reading_with_sensors(memory: RobustMemoryWithReadings, world: int, i: int, n: Any) -> bool:
+    """Linearise the n-th measurement, one of another sensor; return whether its target is ahead of the sensor."""
+    member = memory.measurement[world, i, n].member
+    point = memory.measurement[world, i, n].point
+    own = memory.member[world, i, 0].pose
+    mounted = memory.reading[world, i, n].rotation
+    z = point
+    target_R = memory.reading[world, i, n].turn
+    theirs_R = wp.identity(3, wp.float64)
+    if member > 0:
+        theirs_R = memory.member[world, i, member].pose.R
+        z = memory.member[world, i, member].pose.p + theirs_R * point
+        target_R = theirs_R * target_R
+    R = own.R * mounted
+    p = own.p + own.R * memory.reading[world, i, n].place
+    kind = memory.reading[world, i, n].kind
+    value = memory.reading[world, i, n].value
+    residual, predicted, by_own, by_target = rows_of_kind(kind, value, R, p, target_R, z)
+    line = wp.transpose(own.R) * (z - p)
+    distance = wp.max(wp.length(line), wp.float64(1.0e-9))
+    u = line / distance
+    along, across = relative_spread(memory, world, i, member, wp.transpose(own.R) * theirs_R, u)
+    frames = linearised_frames(member, memory.reading[world, i, n].period)
+    arm = own.R * skew(memory.reading[world, i, n].place)
+    reach = theirs_R * skew(point)
+    H = mat26d()
+    G = mat26d()
+    r = vec2d()
+    used = int(0)
+    for k in range(2):
+        row = 2 * memory.reading[world, i, n].part + k
+        if row < 6:
+            turn = vec3d(by_own[row, 0], by_own[row, 1], by_own[row, 2])
+            shift = vec3d(by_own[row, 3], by_own[row, 4], by_own[row, 5])
+            their_turn = vec3d(by_target[row, 0], by_target[row, 1], by_target[row, 2])
+            their_shift = vec3d(by_target[row, 3], by_target[row, 4], by_target[row, 5])
+            variance = memory.measurement[world, i, n].variance * wp.length_sq(their_shift)
+            variance += memory.reading[world, i, n].turn_variance * wp.length_sq(their_turn)
+            if kind != RELATIVE_POSE:  # which is linear in the positions
+                radial = wp.dot(own.R * u, their_shift)
+                lateral = wp.length_sq(their_shift) - radial * radial
+                bent = lateral * along + wp.float64(0.5) * radial * radial * across
+                variance += frames * bent * across / (distance * distance)
+            std = wp.max(memory.reading[world, i, n].std[row], wp.float64(MIN_BEARING_STD))
+            scale = wp.float64(1.0) / wp.sqrt(std * std + variance)
+            own_turn = mounted * turn - wp.transpose(arm) * shift
+            own_shift = wp.transpose(own.R) * shift
+            member_turn = vec3d()
+            member_shift = vec3d()
+            if member > 0:
+                member_turn = memory.reading[world, i, n].turn * their_turn - wp.transpose(reach) * their_shift
+                member_shift = wp.transpose(theirs_R) * their_shift
+            total = residual[row] + wp.length_sq(own_turn) + wp.length_sq(member_turn)
+            if wp.isfinite(total + wp.length_sq(own_shift) + wp.length_sq(member_shift)):
+                r[k] = scale * residual[row]
+                for j in range(3):
+                    H[k, j] = scale * own_turn[j]
+                    H[k, j + 3] = scale * own_shift[j]
+                    G[k, j] = scale * member_turn[j]
+                    G[k, j + 3] = scale * member_shift[j]
+                if wp.length_sq(turn) + wp.length_sq(shift) > wp.float64(0.0):
+                    used += 1
+    memory.reading[world, i, n].used = used
+    memory.derivative[world, i, n, 0] = Derivative(0, H)
+    memory.derivative[world, i, n, 1] = Derivative(wp.where(member > 0, member, -1), G)
+    memory.derivative[world, i, n, 2] = Derivative(-1, mat26d())
+    memory.derivative[world, i, n, 3] = Derivative(-1, mat26d())
+    memory.measurement[world, i, n].residual = r
+    memory.measurement[world, i, n].distance = wp.where(
+        wp.ddot(by_target, by_target) > wp.float64(0.0), distance, wp.float64(wp.inf)
+    )
+    memory.measurement[world, i, n].noise = wp.float64(1.0)
+    if kind == BEARING or kind == RANGE_BEARING:  # noqa: SIM109 (Warp has no tuples)
+        return predicted[0] * value[0] + predicted[1] * value[1] + predicted[2] * value[2] > wp.float64(0.0)
+    return True
