@@ -49,7 +49,7 @@ def measured_message(tick: Tick) -> Message:
 
 
 class OtherMeasurements(NamedTuple):
-    """What measurements of a frame have beside bearings; m entries, of which those of the camera are not read."""
+    """Entries of the measurements of a frame beside bearings, m of each; those of the camera are not read."""
 
     sensor: NDArray[np.int64]  # (m,) its number among the vehicle's sensors, or CAMERA
     values: Array  # (m, MOST_VALUES)
@@ -246,7 +246,7 @@ def rows_of(pose: UncertainPose, tick: Tick, measured: UsableMeasurements, numbe
     """Return the linearised measurements of one sensor, all of a frame's that are its own."""
     sensor, others = tick.readings[number].sensor, measured.others
     assert others is not None
-    own = sensor.placed(pose.R, pose.p, tick.velocity, tick.angular_velocity)
+    own = sensor.placed(pose.R, pose.p, tick.velocity, tick.angular_velocity, tick.landmarks_by_name)
     target = Placed(measured.positions, others.rotation, others.velocity, np.zeros_like(others.velocity))
     return sensor.linearised(pose.R, own.repeated(len(measured.targets)), target, others.values[:, : sensor.kind.size])
 

@@ -1,4 +1,4 @@
-"""Simple drivers: at constant speed, by the car ahead, waiting when lost, or turning to landmarks.
+"""Simple drivers: at constant speed, by cars ahead or behind, waiting when lost, or turning to landmarks.
 
 The baseline is in route_follower.py.
 """
@@ -92,6 +92,33 @@ class StopWhenLost(RouteFollower):
         waited[:] = np.where(lost, waited + 1, 0)
         stands = lost & (waited <= self.longest)
         return np.where(stands, 0.0, super().speed(observations, points))
+
+
+class KeepContact(RouteFollower):
+    """The route follower, which slows down where the next car behind falls back towards the reach of its sensors.
+
+    Sensors between vehicles then keep measuring, from the first car to the last. Up to half of the reach it drives at
+    full speed, beyond it ever slower.
+    """
+
+    needs = ("message_position",)
+    slowest = 0.25  # of the top speed, so that a car behind that never moves again does not hold it for ever
+
+    def __init__(self, scenario: Scenario) -> None:
+        """See `Driver`."""
+        super().__init__(scenario)
+        ranges = [sensor.range for sensor in scenario.sensors] + [camera.range for camera in scenario.cameras]
+        self.reach = min((reach for reach in ranges if reach is not None), default=np.inf)
+        """Shortest range of any sensor, m."""
+
+    def speed(self, observations: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
+        """See `RouteFollower.speed`."""
+        mask, place, _ = self.reported(observations)
+        behind = mask & (place[..., 0] < 0.0)
+        gap = np.min(np.linalg.norm(place, axis=-1), axis=1, where=behind, initial=np.inf)
+        gap = np.where(behind.any(axis=1), gap, 0.0)  # without a car behind nothing is to keep
+        share = np.clip(2.0 * (1.0 - gap / self.reach), self.slowest, 1.0)
+        return np.asarray(share * super().speed(observations, points))
 
 
 class Peek(RouteFollower):

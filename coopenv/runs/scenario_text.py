@@ -22,6 +22,7 @@ from coopenv.scenario.bodies import (
 )
 from coopenv.scenario.schema import Scenario, neighbour_sets
 from coopenv.scenario.sensing import Camera
+from coopenv.scenario.sensors import SensorSection
 
 MANY_LANDMARKS = 4  # from this number on, `all landmarks` stands for their names
 
@@ -178,8 +179,33 @@ IMAGE_FIELDS = ("image_size", "focal_length", "principal_point", "distortion", "
 """Settings of a camera that matter only where it has an image, as a pinhole camera does."""
 
 
+def sensor_row(section: SensorSection) -> tuple[str, ...]:
+    """Return a sensor's name and kind, targets, limits, noise and errors in words, one line per fact."""
+    made, correlated, outages = section.made, section.correlated, section.outages
+    towards = made.towards if section.towards is None else section.towards
+    stds = dict.fromkeys(f"{number(std)} {unit}" for std, unit in zip(section.white, made.units, strict=True))
+    return (
+        section.label if section.label == section.kind else f"{section.label} ({section.kind})",
+        ", ".join(section.vehicles or ["all vehicles"]),
+        lines(", ".join(towards), not section.occluded and "through buildings and bodies"),
+        lines(
+            section.rate and f"{number(section.rate)} Hz",
+            section.range and f"up to {number(section.range)} m",
+            section.field_of_view and f"in {number(math.degrees(section.field_of_view))} deg",
+        ),
+        ", ".join(stds),
+        lines(
+            section.bias and f"bias {number(section.bias)}",
+            correlated.std and f"{number(correlated.std)}, correlated over {number(correlated.time)} s",
+            outages.rate and f"{number(60.0 * outages.rate)} outages a minute of {number(outages.duration)} s",
+            section.miss_probability and f"{number(100.0 * section.miss_probability)} % missed",
+            section.outliers.probability and f"{number(100.0 * section.outliers.probability)} % outliers",
+        ),
+    )
+
+
 def scene(scenario: Scenario, grouped: bool = True) -> Iterator[Table]:
-    """Yield the tables of vehicles, routes, landmarks and buildings, without empty tables and empty columns.
+    """Yield the tables of vehicles, sensors, routes, landmarks and buildings, without empty tables and columns.
 
     `grouped`: whether landmarks that a group draws have rows of their own.
     """
@@ -187,6 +213,8 @@ def scene(scenario: Scenario, grouped: bool = True) -> Iterator[Table]:
     vehicles = ((name, start(v), estimate(v.initial_estimate), vehicle_motion(v), seen) for name, v, seen in pairs)
     columns = ("vehicle", "start", "initial estimate", "motion", "may measure")
     yield from _listing("Vehicles (m)", columns, vehicles)
+    columns = ("sensor", "on", "towards", "limits", "noise", "further errors")
+    yield from _listing("Sensors beside the camera", columns, map(sensor_row, scenario.sensors))
     routes = (
         (
             *(r.name, ", ".join(map(vector, r.waypoints)), f"radius {number(r.corner_radius)}"),

@@ -481,14 +481,18 @@ def _problems_of_sequels(s: Scenario) -> Iterator[str]:
 
 
 def _doubts(s: Scenario, neighbours: Sequence[Sequence[int]]) -> Iterator[str]:
-    """Yield where the paper's conditions for convergence are not met by construction."""
+    """Yield where the paper's conditions for convergence are not met by construction.
+
+    The numbers of landmarks and neighbours count where bearings are the only measurements.
+    """
+    bearings_alone = not s.sensors
     lonely = [f"vehicle_{i + 1}" for i, targets in enumerate(neighbours) if len(targets) < 3]
-    if (count := len(s.landmarks)) < 3:
+    if bearings_alone and (count := len(s.landmarks)) < 3:
         yield (
             f"only {count} landmark{'s' if count != 1 else ''}: with fewer than three the paper's Assumption 2 "
             "fails and observability is not guaranteed"
         )
-    elif lonely:
+    elif bearings_alone and lonely:
         verb = "has" if len(lonely) == 1 else "have"
         yield f"{listed(lonely)} {verb} fewer than three neighbours: observability is not guaranteed"
     for landmark in s.landmarks if s.observer.name == "riccati" else ():

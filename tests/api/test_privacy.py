@@ -24,7 +24,7 @@ MOVABLE = [name for name, scenario in SHIPPED.items() if scenario.backend == "si
 """Environments whose vehicles a saved state can put elsewhere; highway-env puts its own back where it has them, and the
 traffic of the city drives by the truth."""
 FIRST_SEES_NO_VEHICLE = [
-    name for name in MOVABLE if max(neighbour_sets(SHIPPED[name])[0]) < len(SHIPPED[name].landmarks)
+    name for name in MOVABLE if max(neighbour_sets(SHIPPED[name])[0], default=-1) < len(SHIPPED[name].landmarks)
 ]
 """In take_turns it measures the vehicle that follows it."""
 ON_HIGHWAY = [name for name, scenario in SHIPPED.items() if scenario.backend == "highway"]
@@ -39,8 +39,9 @@ EVERYTHING = {"observation.include": list(GROUPS)}
 
 
 def silent(name: str, observer: str, more: dict[str, Any] | None = None) -> Scenario:
-    """An environment whose cameras see nothing, so that no measurement depends on true poses."""
+    """An environment whose cameras and other sensors measure nothing, so that nothing depends on true poses."""
     blind = {"topology.mode": "sensed", "camera.range": 1e-6, "observer.name": observer}
+    blind |= {"sensing": "blind"} if load_scenario(name).sensors else {}
     return load_scenario(name, {**EVERYTHING, **blind, **(more or {})})
 
 

@@ -15,7 +15,7 @@ from coopenv.policies.look_ahead import LookAhead, TeamLookAhead
 from coopenv.policies.prediction import FieldOfView, Occluder, Occluders, PlanarCovariance, unhidden
 from coopenv.policies.right_of_way import discs_along, nearest
 from coopenv.policies.route_follower import RouteFollower
-from coopenv.policies.scripted import IntelligentDriver, Peek, StopWhenLost
+from coopenv.policies.scripted import IntelligentDriver, KeepContact, Peek, StopWhenLost
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.four_way import FOUR_WAY
 from tests.oracles.geometry import is_occluded
@@ -72,6 +72,15 @@ def other(x: float, y: float, angle: float) -> dict[str, object]:
     place, forward = np.zeros((3, 3)), np.zeros((3, 3))
     place[0], forward[0] = (x, y, 0.0), (np.cos(angle), np.sin(angle), 0.0)
     return {"message_position": place, "message_forward": forward, "message_mask": [1, 0, 0]}
+
+
+@pytest.mark.parametrize(
+    ("x", "speed"), [(2.0, 1.0), (-2.9, 1.0), (-4.5, 0.5), (-6.0, 0.25), (-40.0, 0.25)], ids=lambda value: f"{value:g}"
+)
+def test_contact_is_kept_by_waiting_for_the_next_car_behind(x: float, speed: float) -> None:
+    """Cameras reach 6 m: full speed up to half of it, and nothing at its end, but for the slowest pace."""
+    driver = KeepContact(SCENARIO)
+    assert driver.drive(observation(**other(x, 0.3, 0.0)))[0][0] == pytest.approx(speed * driver.cruise, rel=0.02)
 
 
 @pytest.mark.parametrize(

@@ -162,6 +162,12 @@ def test_a_sound_scenario_does_not_warn(origin: float) -> None:
         parse_scenario(builders.raw(map={"origin": [origin, 0, 0]}), "here")
 
 
+def test_the_number_of_landmarks_is_not_doubted_with_sensors_beside_the_camera() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        parse_scenario(builders.raw([vehicle()], landmarks=[], sensors=[{"kind": "position"}]), "here")
+
+
 def shifted(origin: tuple[float, float, float], **sections: Any) -> dict[str, Any]:
     """Return a noisy scene whose every position is given in the same file coordinates, whatever the map's origin."""
     estimate = {"position_offset": [0.4, -0.3, 0.2], "orientation_offset_wxyz": [0.98, 0.0, 0.0, 0.198997487]}
