@@ -68,7 +68,8 @@ class Placed:
             marks = self.landmarks
             if moving:
                 marks = Landmarks({**marks, **{name: at[n] for name, at in moving.items()}})
-            yield Placed(*(part[n] for part in parts), landmarks=marks)
+            position, rotation, velocity, turning = (part[n] for part in parts)
+            yield Placed(position, rotation, velocity, turning, marks)
 
 
 class Landmarks(dict[str, Array]):
