@@ -64,9 +64,12 @@ class Placed:
             for name, at in self.landmarks.items()
             if np.ndim(at) > 1
         }
-        for n, of_one in enumerate(zip(*parts, strict=True)):
-            now = Landmarks({**self.landmarks, **{name: at[n] for name, at in moving.items()}}) if moving else None
-            yield Placed(*of_one, landmarks=self.landmarks if now is None else now)
+        for n in range(len(parts[0])):
+            marks = self.landmarks
+            if moving:
+                marks = Landmarks({**marks, **{name: at[n] for name, at in moving.items()}})
+            position, rotation, velocity, turning = (part[n] for part in parts)
+            yield Placed(position, rotation, velocity, turning, marks)
 
 
 class Landmarks(dict[str, Array]):

@@ -26,6 +26,7 @@ from coopenv.scenario import Scenario
 from coopenv.sources.base import Capabilities, TickGenerator, TickStream
 from coopenv.sources.mcap import read_recording, write_recording
 from coopenv.sources.selection import Selection
+from coopenv.sources.sources import open_backend
 from coopenv.sources.tick_world import TickWorld
 from coopenv.sources.worlds import Replay, Simulated, scenario_of
 from tests.helpers.builders import circling, scenario
@@ -99,6 +100,9 @@ def test_a_log_whose_sensor_class_is_gone_is_refused_in_one_line(tmp_path: Path)
 
 def test_a_log_runs_no_class_that_its_user_has_not_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mcap", reason="needs the extra 'log'")
+    from coopenv.sources.mcap_container import Container
+    from coopenv.sources.mcap_format import ATTACHMENT
+
     own, path = tmp_path / "hers.py", tmp_path / "drive.mcap"
     own.write_text("class Height:\n    noise, towards, has_target = 0.1, ('map',), False\n"
                    "    def predict(self, own, target):\n        return own.position[2]\n")  # fmt: skip
