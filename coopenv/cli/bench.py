@@ -75,6 +75,13 @@ class ObserverOptions:
         str | None,
         typer.Option("--policy", "--agent", help="Agent or policy that drives in the records.", **arguments.POLICY),
     ] = None
+    sensors: Annotated[
+        bool,
+        typer.Option(
+            "--sensors",
+            help="Compare with the camera alone, each other sensor alone, the camera with each, and all sensors.",
+        ),
+    ] = False
     seeds: Annotated[
         int | None, typer.Option(min=1, help="Number of seeds (default: 5; recorded robots and logs have one record).")
     ] = None
@@ -124,22 +131,23 @@ class ObserverOptions:
     def plan(self) -> "Plan":
         """Return the comparison, everything in it checked."""
         from coopenv.bench.observers.comparison import SEEDS, Plan
-        from coopenv.bench.observers.sources import find_source
+        from coopenv.bench.observers.sources import find_source, with_sensor_sets
         from coopenv.sources.selection import Selection
 
         changes = options.parse_overrides(self.overrides)
         chosen = Selection.of(self.start, self.until, self.robots)
         source = find_source(self.source, changes, self.data, self.topics, self.faults or (), self.policy, chosen)
+        source = with_sensor_sets(source) if self.sensors else source
         seeds = range(self.first, self.first + (self.seeds or SEEDS)) if self.seeds or self.first else None
         return Plan.of(self.names, source, seeds, self.variants, self.steady_from, self.windows)
 
     def command_of(self, plan: "Plan") -> str:
         """Return the command line that gives the same tables again, with all names that a plan has chosen."""
-        added = {variant.name for variant in plan.source.added}
+        added, sets = {variant.name for variant in plan.source.added}, plan.source.sensor_sets
         named = [name for name in plan.variants if name not in added]
-        faults = [name for name in plan.variants if name in added]
+        faults = [name for name in plan.variants if name in added and name not in sets]
         observers = ",".join(dict.fromkeys(self.names or plan.observers))
-        chosen = replace(self, observers=observers, variants=",".join(named), faults=faults)
+        chosen = replace(self, observers=observers, variants=",".join(named) or None, faults=faults)
         return commands.command_text("bench observers", chosen, OF_THE_OUTPUT)
 
 

@@ -96,16 +96,20 @@ class Observability:
 
 
 def analyse_observability(
-    scene: RecordedGeometry, window: float = DEFAULT_WINDOW, threshold: float = DEFAULT_THRESHOLD
+    scene: RecordedGeometry,
+    window: float = DEFAULT_WINDOW,
+    threshold: float = DEFAULT_THRESHOLD,
+    more: Array | None = None,
 ) -> Observability:
     """Evaluate W(t) for every camera tick at which a whole window begins.
 
     True poses and the visibility of the run are used: the question is the available information, not its use
     of it. Neighbours count as known, as in the theorem, which takes the vehicles one after the other along
     the graph. The window is in s; the threshold is the verdict on the local eigenvalue, see `Observability`.
+    `more` (K, N, 6, 6) is information beside that of bearings, map axes, about the map's origin.
     """
     window = min(window, float(scene.t[-1] - scene.t[0]))
-    start, W, anchor = _windows_about_anchor(scene, window)
+    start, W, anchor = _windows_about_anchor(scene, window, more)
     eigenvalues = np.linalg.eigvalsh(_move_origin(W, -anchor))
     smallest, largest = eigenvalues[..., 0], eigenvalues[..., -1]
     regular = smallest > np.finfo(float).eps * largest
@@ -122,7 +126,9 @@ def analyse_observability(
     )
 
 
-def _windows_about_anchor(scene: RecordedGeometry, window: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _windows_about_anchor(
+    scene: RecordedGeometry, window: float, more: Array | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return start ticks (M,), W in map axes (M, N, 6, 6), and the points (N, 3) in m that it is taken about.
 
     A point amid the vehicle's path keeps the running sums, and so the rounding of their differences, small.
@@ -130,6 +136,7 @@ def _windows_about_anchor(scene: RecordedGeometry, window: float) -> tuple[np.nd
     anchor = scene.position.mean(axis=0)
     t, vehicles = scene.t, range(scene.position.shape[1])
     rate = np.stack([_information_of(scene, i, anchor[i]) for i in vehicles], axis=1)
+    rate = rate if more is None else rate + _move_origin(more, anchor)
     step = np.diff(t)[:, None, None, None]
     total = np.concatenate([np.zeros_like(rate[:1]), np.cumsum(0.5 * step * (rate[1:] + rate[:-1]), axis=0)])
     slack = 1e-6 * max(window, np.finfo(float).tiny)

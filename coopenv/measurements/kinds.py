@@ -1,6 +1,6 @@
-"""What a kind of measurement is, and the table of kinds."""
+"""Kinds of measurements: their interface, and the table of all shipped ones."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from coopenv.base.errors import check_one_of
 from coopenv.estimation.poses import Array, skew
 
 MOST_ROWS = 6  # of a kind, and numbers of its value
 STEP = 1e-3
 """rad and m, of differences, whose error is of the fourth order: 1e-11 for a range of 50 m."""
-WEIGHTS = {1.0: 2.0 / 3.0, 2.0: -1.0 / 12.0}  # of central differences over one and two steps
+STEPS = {1.0: 2.0 / 3.0, -1.0: -2.0 / 3.0, 2.0: -1.0 / 12.0, -2.0: 1.0 / 12.0}  # weights of values at such steps
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class Placed:
     rotation: Array  # (..., 3, 3) own axes to map
     velocity: Array  # (..., 3) map axes, m/s
     angular_velocity: Array  # (..., 3) own axes, rad/s
-    landmarks: Mapping[str, Array] = field(default_factory=dict)  # positions (3,) on the vehicle's map by name, m
+    landmarks: Mapping[str, Array] = field(default_factory=dict)
+    """Positions (3,) by name on the vehicle's map, m, of a sensor; (..., 3) if they move within a batch."""
 
     @classmethod
     def at(cls, position: Array, rotation: Array | None = None) -> "Placed":
@@ -44,20 +46,34 @@ class Placed:
         return replace(self, position=self.position + error[..., 3:], rotation=turned, velocity=velocity)
 
     def repeated(self, count: int) -> "Placed":
-        """Return a batch (count,) of this one."""
+        """Return a batch (count, ...) of this one."""
+        batch = (count, *self.position.shape[:-1])
         arrays: dict[str, Any] = {
-            name: np.broadcast_to(getattr(self, name), (count, *of)) for name, of in SHAPES.items()
+            name: np.broadcast_to(getattr(self, name), (*batch, *of)) for name, of in SHAPES.items()
         }
         return replace(self, **arrays)
 
     def each(self) -> Iterator["Placed"]:
         """Yield the entries of a batch."""
         shape = self.position.shape[:-1]
-        for index in np.ndindex(shape):
-            arrays: dict[str, Any] = {
-                name: np.broadcast_to(getattr(self, name), (*shape, *of))[index] for name, of in SHAPES.items()
-            }
-            yield replace(self, **arrays)
+        parts = [np.broadcast_to(getattr(self, name), (*shape, *of)).reshape(-1, *of) for name, of in SHAPES.items()]
+        moving = {
+            name: np.broadcast_to(at, (*shape, 3)).reshape(-1, 3)
+            for name, at in self.landmarks.items()
+            if np.ndim(at) > 1
+        }
+        for n, of_one in enumerate(zip(*parts, strict=True)):
+            now = Landmarks({**self.landmarks, **{name: at[n] for name, at in moving.items()}}) if moving else None
+            yield Placed(*of_one, self.landmarks if now is None else now)
+
+
+class Landmarks(dict[str, Array]):
+    """Positions of landmarks by name."""
+
+    def __missing__(self, name: str) -> Array:
+        """Refuse an unknown name. Raises CoopenvError: it names the known ones."""
+        check_one_of("own.landmarks: unknown landmark", name, self)
+        raise KeyError(name)
 
 
 SHAPES = {"position": (3,), "rotation": (3, 3), "velocity": (3,), "angular_velocity": (3,)}
@@ -144,21 +160,18 @@ class Kind:
 
     def differences(self, own: Placed, target: Placed) -> tuple[Array, Array]:
         """Return the derivatives of `jacobian` by central differences of the fourth order."""
-        value = self.predict(own, target)
+        value, count = self.predict(own, target), 6 * len(STEPS)
+        errors = (STEP * np.array([*STEPS])[:, None, None] * np.eye(6)).reshape(
+            count, *[1] * (own.position.ndim - 1), 6
+        )
+        weights = np.array([*STEPS.values()]) / STEP
 
-        def derivative(move: Callable[[Array], tuple[Placed, Placed]]) -> Array:
-            columns = []
-            for axis in np.eye(6):
-                column: Any = 0.0
-                for steps, weight in WEIGHTS.items():
-                    error = np.broadcast_to(steps * STEP * axis, (*own.position.shape[:-1], 6))
-                    ahead, behind = (self.residual(self.predict(*move(e)), value) for e in (error, -error))
-                    column = column + (ahead - behind) * (weight / STEP)
-                columns.append(column)
-            return np.stack(columns, axis=-1)
+        def derivative(own: Placed, target: Placed) -> Array:
+            change = self.residual(self.predict(own, target), np.broadcast_to(value, (count, *value.shape)))
+            return np.einsum("s,sa...->...a", weights, change.reshape(len(STEPS), 6, *change.shape[1:]))
 
-        by_own = derivative(lambda error: (own.moved(error), target))
-        by_target = derivative(lambda error: (own, target.moved(error))) if self.has_target else np.zeros_like(by_own)
+        by_own = derivative(own.moved(errors), target.repeated(count))
+        by_target = derivative(own.repeated(count), target.moved(errors)) if self.has_target else np.zeros_like(by_own)
         return by_own, by_target
 
 

@@ -11,10 +11,14 @@ from numpy.typing import NDArray
 from coopenv.base.errors import CoopenvError, error_text, shown
 from coopenv.base.installation import load_reference
 from coopenv.estimation.poses import Array
-from coopenv.measurements.kinds import MOST_ROWS, Kind, Placed, exponential
+from coopenv.measurements.kinds import MOST_ROWS, Kind, Landmarks, Placed, exponential
 
 AGREEMENT = 1e-4  # of a derivative with differences, relative to its largest entry
 TRIALS = 3  # places at which a kind is tried before it is used
+
+
+class SensorError(CoopenvError):
+    """A user's sensor cannot be used, or has raised something; the message names file, class and function."""
 
 
 class OwnKind(Kind):
@@ -33,12 +37,12 @@ class OwnKind(Kind):
         self.reference = reference
         made = load_reference(reference)
         if not (inspect.isclass(made) and callable(getattr(made, "predict", None))):
-            raise CoopenvError(f"sensor '{reference}': expected a class with predict(own, target), got {shown(made)}")
+            raise SensorError(f"sensor '{reference}': expected a class with predict(own, target), got {shown(made)}")
         self.own = self._call("its start", made, **options)
-        self.has_target = bool(getattr(made, "has_target", True))
-        self.towards = tuple(getattr(made, "towards", Kind.towards if self.has_target else ("map",)))
+        self.has_target = bool(getattr(self.own, "has_target", True))
+        self.towards = self._names("towards", Kind.towards if self.has_target else ("map",))
         for name in ("in_warp", "drawn", "under_sky"):
-            setattr(self, name, getattr(made, name, getattr(Kind, name)))
+            setattr(self, name, getattr(self.own, name, getattr(Kind, name)))
         self._try()
 
     def predict(self, own: Placed, target: Placed) -> Array:
@@ -91,21 +95,22 @@ class OwnKind(Kind):
         return np.array(values).reshape(*own.position.shape[:-1], size)
 
     def _call(self, name: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-        """Return the result of a user's function. Raises CoopenvError: it raises something."""
+        """Return the result of a user's function. Raises SensorError: it raises something."""
         try:
             return function(*arguments, **options)
         except Exception as error:  # of any user's code
-            raise CoopenvError(f"sensor '{self.reference}': {name}: {error_text(error)}") from error
+            raise SensorError(f"sensor '{self.reference}': {name}: {error_text(error)}") from error
 
     def _checked(self, name: str, value: Any, *shape: int) -> Array:
-        """Return an array of a shape. Raises CoopenvError: it has another one, or is no array of numbers."""
+        """Return an array of a shape. Raises SensorError: it has another one, or is no array of numbers."""
         try:
             array = np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError):
             array = np.empty(0)
-        array = array.reshape(1) if array.shape == () and shape == (1,) else array
+        if shape[0] == 1 and array.shape == shape[1:]:  # one row may come without its axis
+            array = array.reshape(shape)
         if array.shape != shape:
-            raise CoopenvError(f"sensor '{self.reference}': {name}: expected shape {shape}, got {shown(value)}")
+            raise SensorError(f"sensor '{self.reference}': {name}: expected shape {shape}, got {shown(value)}")
         return array
 
     def _try(self) -> None:
@@ -113,21 +118,22 @@ class OwnKind(Kind):
         rng = np.random.default_rng(0)
         places = [placed_at_random(rng) for _ in range(2 * TRIALS)]
         for own, target in zip(places[::2], places[1::2], strict=True):
-            value = np.asarray(self._call("predict", self.own.predict, own, target), dtype=np.float64)
-            self.size = max(1, value.size)
-            if value.ndim > 1 or self.size > MOST_ROWS:
-                raise CoopenvError(f"sensor '{self.reference}': predict: expected 1 to 6 numbers, got {shown(value)}")
-            value = value.reshape(self.size)
-            if not np.isfinite(value).all():
-                raise CoopenvError(f"sensor '{self.reference}': predict: not finite: {shown(value.tolist())}")
-            change = self.own.residual(value, value) if hasattr(self.own, "residual") else value
-            self.rows = max(1, np.size(change))
+            value = self._numbers("predict", self._call("predict", self.own.predict, own, target))
+            self.size = len(value)
+            change: Any = value
+            if hasattr(self.own, "residual"):
+                change = self._call("residual", self.own.residual, value, value)
+            self.rows = len(self._numbers("residual", change))
             self.noise = self._noise()
             self.needs = self._needs(own, target) if self.has_target else ()
             if self.rows != self.size and not hasattr(self.own, "sample"):
                 sizes = f"predict returns {self.size} numbers and residual {self.rows}"
-                raise CoopenvError(f"sensor '{self.reference}': sample: missing; {sizes}")
-            self.units = tuple(getattr(self.own, "units", ("1",) * self.rows))
+                raise SensorError(f"sensor '{self.reference}': sample: missing; {sizes}")
+            self.units = self._names("units", ("1",) * self.rows)
+            if len(self.units) != self.rows:
+                raise SensorError(f"sensor '{self.reference}': units: {len(self.units)} for {self.rows} rows")
+            self._numbers("sample", self.sample(value, 0.1 * np.array(self.noise)))
+            self.sensed(own, target)
             if hasattr(self.own, "jacobian"):
                 self._compare(own, target)
 
@@ -143,12 +149,36 @@ class OwnKind(Kind):
             found += [] if known else [name]
         return tuple(found)
 
+    def _names(self, attribute: str, usual: tuple[str, ...]) -> tuple[str, ...]:
+        """Return an attribute of the class: one text, or several. Raises SensorError: it is something else."""
+        given = getattr(self.own, attribute, usual)
+        names = (given,) if isinstance(given, str) else given
+        if not (isinstance(names, tuple | list) and all(isinstance(name, str) for name in names)):
+            raise SensorError(f"sensor '{self.reference}': {attribute}: expected texts, got {shown(given)}")
+        return tuple(names)
+
+    def _numbers(self, name: str, value: Any) -> Array:
+        """Return 1 to 6 finite numbers as a vector. Raises SensorError: it is something else."""
+        try:
+            array = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            array = np.empty((0, 0))
+        if array.ndim > 1 or not 1 <= array.size <= MOST_ROWS:
+            raise SensorError(f"sensor '{self.reference}': {name}: expected 1 to 6 numbers, got {shown(value)}")
+        if not np.isfinite(array).all():
+            raise SensorError(f"sensor '{self.reference}': {name}: not finite: {shown(value)}")
+        return array.reshape(-1)
+
     def _noise(self) -> tuple[float, ...]:
-        given = np.atleast_1d(np.asarray(getattr(self.own, "noise", np.nan), dtype=float))
+        stated = getattr(self.own, "noise", np.nan)
+        try:
+            given = np.atleast_1d(np.asarray(stated, dtype=float))
+        except (TypeError, ValueError):
+            raise SensorError(f"sensor '{self.reference}': noise: expected numbers, got {shown(stated)}") from None
         noise = np.broadcast_to(given, self.rows) if given.size in (1, self.rows) else np.full(1, np.nan)
         if not (noise > 0.0).all():
             expected = f"one positive number, or {self.rows} of them"
-            raise CoopenvError(f"sensor '{self.reference}': noise: expected {expected}, got {shown(given.tolist())}")
+            raise SensorError(f"sensor '{self.reference}': noise: expected {expected}, got {shown(given.tolist())}")
         return tuple(noise.tolist())
 
     def _compare(self, own: Placed, target: Placed) -> None:
@@ -157,13 +187,26 @@ class OwnKind(Kind):
             off = float(np.abs(given - right).max())
             if not off <= AGREEMENT * max(1.0, float(np.abs(right).max())):
                 row, column = np.unravel_index(np.argmax(np.abs(given - right)), right.shape)
-                raise CoopenvError(
+                raise SensorError(
                     f"sensor '{self.reference}': jacobian by {name}: entry [{row}, {column}] is "
                     f"{given[row, column]:.6g}, by differences {right[row, column]:.6g}"
                 )
 
 
+class AnyLandmarks(Landmarks):
+    """Landmarks of every name, at random positions."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        super().__init__()
+        self._rng = rng
+
+    def __missing__(self, name: str) -> Array:
+        """Return the position of one more landmark."""
+        return self.setdefault(name, self._rng.uniform(-10.0, 10.0, 3))
+
+
 def placed_at_random(rng: np.random.Generator) -> Placed:
     """Return a place some metres from the origin, in motion."""
     axes = exponential(rng.normal(size=3))
-    return Placed(rng.uniform(-10.0, 10.0, 3), axes, rng.normal(size=3), 0.1 * rng.normal(size=3))
+    twist = rng.normal(size=3), 0.1 * rng.normal(size=3)
+    return Placed(rng.uniform(-10.0, 10.0, 3), axes, *twist, AnyLandmarks(np.random.default_rng(1)))

@@ -5,6 +5,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,10 +14,13 @@ from numpy.typing import NDArray
 from coopenv.base.errors import check_one_of
 from coopenv.base.installation import is_reference
 from coopenv.estimation.poses import Array, skew
-from coopenv.measurements.kinds import KINDS, Kind, Placed
+from coopenv.measurements.kinds import KINDS, Kind, Landmarks, Placed
 
+NOTHING = Landmarks()
 MAP = -1
 """Target of a kind that measures the map."""
+COMPARED_AT = 10.0
+"""Distance (m) of a target whose bearing a measurement of the map is compared with in the Gramian."""
 
 
 def kind_of(reference: str, options: str = "{}") -> Kind:
@@ -71,13 +75,14 @@ class Sensor:
     position: Array  # (3,) in the body frame, m
     rotation: Array  # (3, 3) sensor to body
     options: str = "{}"  # arguments of a user's class, JSON
+    std_by_distance: float = 0.0  # of the noise beside `std`, per m to the target
 
     @property
     def kind(self) -> Kind:
-        """What it measures."""
+        """Kind of measurement."""
         return kept_kind(self.reference, self.options)
 
-    def placed(self, R: Array, p: Array, velocity: Array, angular_velocity: Array, landmarks: Any = None) -> Placed:
+    def placed(self, R: Array, p: Array, velocity: Array, angular_velocity: Array, landmarks: Any = NOTHING) -> Placed:
         """Return where it is on a body at R (..., 3, 3), p (..., 3) with a twist (..., 3) in body axes."""
         turned = R @ self.rotation
         at_sensor = velocity + np.cross(angular_velocity, self.position)
@@ -86,7 +91,7 @@ class Sensor:
             turned,
             np.asarray((R @ at_sensor[..., None])[..., 0]),
             angular_velocity @ self.rotation,
-            landmarks or {},
+            landmarks,
         )
 
     def linearised(self, R: Array, own: Placed, target: Placed, values: Array) -> LinearRows:
@@ -99,23 +104,33 @@ class Sensor:
         by_own = np.concatenate([by_turn @ self.rotation.T - by_shift @ arm, by_shift @ R], axis=-1)
         used = np.isfinite(residual) & np.isfinite(by_own).all(axis=-1)
         used &= np.isfinite(by_target).all(axis=-1)
+        variances = np.broadcast_to(np.square(self.std), residual.shape)
+        if self.std_by_distance:
+            square = np.sum((target.position - own.position) ** 2, axis=-1)
+            variances = variances + self.std_by_distance**2 * square[..., None]
         return LinearRows(
             np.where(used, residual, 0.0),
             np.where(used[..., None], by_own, 0.0),
             np.where(used[..., None], by_target, 0.0),
-            np.where(used, np.square(self.std), 1.0),
+            np.where(used, variances, 1.0),
             used,
         )
 
 
-@cache
 def kept_kind(reference: str, options: str) -> Kind:
-    """Return `kind_of`, made once."""
+    """Return `kind_of`, made once, and again after the file of a user's class has changed."""
+    file = Path(reference.rpartition(":")[0])
+    changed = file.stat().st_mtime_ns if file.suffix == ".py" and file.exists() else 0
+    return _kept(reference, options, changed)
+
+
+@cache
+def _kept(reference: str, options: str, changed: int) -> Kind:
     return kind_of(reference, options)
 
 
 class Reading(NamedTuple):
-    """What one sensor has measured at a tick."""
+    """Measurements of one sensor at a tick."""
 
     sensor: Sensor
     values: Array  # (m, size) in the order of the sensor's targets, NaN where nothing was measured

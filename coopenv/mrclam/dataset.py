@@ -17,7 +17,7 @@ from coopenv.estimation.poses import MISFIT_DEG, Array, about_z, bearing_misfit_
 
 NAMES = tuple(f"mrclam_{number}" for number in range(1, 10))
 IN_SPACE = "_space"
-"""Behind a name: the robots as vehicles in space, with odometry by their wheels."""
+"""May stand behind a name, which it does not change."""
 ENVIRONMENT_VARIABLE = "COOPENV_DATA"
 
 MAX_PAUSE_S = 3600.0  # between two rows; more is a broken time stamp
@@ -350,10 +350,12 @@ class HeldCommands:
         self._t = np.insert(t, long + 1, t[long] + MAX_HOLD_S)
         self._v, self._omega = np.insert(v, long + 1, 0.0), np.insert(omega, long + 1, 0.0)
 
-    def commands(self, t: Array) -> tuple[Array, Array]:
-        """Return the velocity (K,) m/s and angular velocity (K,) rad/s that hold at times t (K,) in s."""
+    def sums(self, t: Array) -> Array:
+        """Return (K, 2) by how many rad and m the robot was to turn and to drive until times t (K,) in s."""
+        rates = np.column_stack([self._omega, self._v])
+        until = np.concatenate([np.zeros((1, 2)), np.cumsum(rates[:-1] * np.diff(self._t)[:, None], axis=0)])
         k = np.searchsorted(self._t, t, side="right") - 1
-        return np.where(k < 0, 0.0, self._v[k]), np.where(k < 0, 0.0, self._omega[k])
+        return np.where((k < 0)[:, None], 0.0, until[k] + rates[k] * (t - self._t[k])[:, None])
 
     def pose(self, t: Array) -> Array:
         """Return x, y in m and heading in rad (K, 3), seen from the pose at the first command, at times t (K,) in s."""

@@ -1,12 +1,15 @@
 """A sub-dataset of MR.CLAM as a `Recording`: five robots with odometry and cameras, and motion capture that judges.
 
-Five planar vehicles (z = 0, yaw only) among 15 landmarks. Ticks are 0.05 s apart; tick 0 is the first odometry sample
+Five robots on a level floor (z = 0) among 15 landmarks. Ticks are 0.05 s apart; tick 0 is the first odometry sample
 of any robot. A camera frame counts at the next tick; its bearings are turned by the odometry's rotation in between.
 All robots receive from all others: at tick k the last message of tick k - 1 or before.
 
-For observers in space the commands become odometry: what the wheels make of them, with noise in proportion to motion.
-All measurements lie in the plane, so that by symmetry an estimate on the plane stays there. That the floor is level is
-a bearing to the zenith, a landmark: it bounds the variances of roll and pitch.
+The camera's bearings are those of the recording; the ranges that it derives from the size of a barcode are readings of
+a sensor `range`. All measurements lie in the plane, so that by symmetry an estimate on the plane stays there. Two more
+sensors bound the variances of what the robots cannot do: `level` measures roll and pitch, `height` measures z.
+
+Odometry is the commands, which a nominal calibration turns into motion. `SensorNoise` declares what the calibration of
+one robot may differ by, so that a filter can estimate it (`coopenv.observers.lasting_errors`).
 """
 
 import math
@@ -17,8 +20,8 @@ from numpy.typing import NDArray
 
 from coopenv.base.errors import DataError, suggest
 from coopenv.estimation.poses import Array, about_z
+from coopenv.measurements.sensor import MAP, Sensor
 from coopenv.mrclam.dataset import MAX_TRUTH_GAP_S, ROBOTS, Dataset, HeldCommands, Robot, arc, load_dataset
-from coopenv.mrclam.planar_model import ARC, CALIBRATING, IROBOT_CREATE, PATH, SLOWING, TURN, TURNING, CommandHistory
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Recording, check_recording, received_by_all
 from coopenv.observers.sensed import Truth
@@ -29,26 +32,35 @@ __all__ = ["VARIANTS", "Dataset", "Variant", "load_dataset", "recording_of"]
 Variant = Literal["landmarks", "landmarks+robots", "blind"]
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
 BLIND_ROBOTS = (3, 4, 5)
-# The next constants were tuned on sub-dataset 6 (docs/data.md); for observers in space on its first 300 s.
 TICK_S = 0.05
 MESSAGE_PERIOD_TICKS = 2  # 10 Hz, as V2X radios send
-NOISE = SensorNoise(velocity=0.15, angular_velocity=0.3, odometry_period=TICK_S, bearing=0.03)
-"""Noise of all sub-datasets. The commands' errors are lasting, not sensor noise; as white noise they amount to
-0.03 m and 0.07 rad per square root of a second."""
-SPATIAL_NOISE = SensorNoise(
+
+# The next constants were tuned on sub-dataset 6 (docs/data.md).
+LEAD_S = 0.2  # by which commands are ahead of the motion
+TURN_SCALE, SPEED_SCALE = 0.93, 1.04  # motion over command
+STRAIGHT_RATE = 0.006  # rad/s, the commanded rate at which a robot drives straight
+TURNING_LOSS = 0.5  # s/rad, share of the speed that a robot loses per rate of turn
+NOISE = SensorNoise(
     velocity=0.002 / math.sqrt(TICK_S),
     angular_velocity=0.008 / math.sqrt(TICK_S),
     odometry_period=TICK_S,
     bearing=0.025,
+    odometry_scale=0.05,
+    camera_orientation=0.02,
+    turn_scale=0.25,
+    curvature=0.05,
+    turning_loss=0.6,
+    odometry_lead=0.1,
     velocity_by_speed=0.12 / math.sqrt(TICK_S),
     angular_velocity_by=(0.1 / math.sqrt(TICK_S), 0.2 / math.sqrt(TICK_S)),
 )
-"""Noise of odometry by the wheels' response. Tuned on the first 300 s of sub-dataset 6."""
-TRAPEZOID_S = TICK_S / 2
-"""Added to the commands' lead: observers in space take a held sample for half a period late, which it is not here."""
-ZENITH, ZENITH_PERIOD_TICKS = (0.0, 0.0, 1e6), 40
-"""m, so far above that a bearing to it depends on roll and pitch alone; and ticks from one of them to the next: few, as
-otherwise they were most of the bearings, by whose misfits an observer finds that it is lost."""
+"""Noise of all sub-datasets."""
+RANGE_STD, RANGE_STD_BY_DISTANCE = 0.1, 0.15
+"""m, and m per m. The errors of ranges have a standard deviation of 0.044 m per m, and those of two ranges to the same
+landmark within a second have a correlation of 0.95, by which they average as white noise of up to 0.27 m per m."""
+FLOOR_STD = 0.01  # rad and m, of the level floor
+UNKNOWN_STD = 1e3  # rad and m, of what the floor does not tell: heading, x and y
+FLOOR_PERIOD_TICKS = 40
 GAINS = (1.0, 10.0, (0.1, 1.0), (0.01, 0.01), 0.1)  # k, q, V, P0, largest turn of a sub-step
 START_STD = (0.01, 0.01)  # rad, m
 DRIFT_STD = (0.05, 0.1)  # rad and m per square root of a second without truth before the start
@@ -61,8 +73,8 @@ def check_variant(name: str) -> Variant:
     return name
 
 
-def recording_of(dataset: Dataset, variant: Variant, in_space: bool = False) -> Recording:
-    """Put a sub-dataset on ticks, for observers on a plane or in space.
+def recording_of(dataset: Dataset, variant: Variant) -> Recording:
+    """Put a sub-dataset on ticks.
 
     Truth is NaN where motion capture is not valid. Every robot starts at its true pose; one that motion capture sees
     later starts at the pose of backward dead reckoning from there. In the variant `landmarks` no robot sees another, in
@@ -73,12 +85,12 @@ def recording_of(dataset: Dataset, variant: Variant, in_space: bool = False) -> 
     """
     check_variant(variant)
     subjects = [*sorted(dataset.landmarks), *ROBOTS]
-    L, N = len(dataset.landmarks) + in_space, len(ROBOTS)
+    L, N = len(dataset.landmarks), len(ROBOTS)
     T = L + N
     t = np.arange(int(dataset.duration_s / TICK_S) + 1, dtype=np.float64) * TICK_S
     K = len(t)
     column = np.zeros(max(subjects) + 1, dtype=np.int64)
-    column[subjects] = np.delete(np.arange(T), L - 1) if in_space else np.arange(T)
+    column[subjects] = np.arange(T)
     arrays: dict[str, Any] = {
         "rotation": np.broadcast_to(np.eye(3), (K, N, 3, 3)).copy(),
         **{name: np.zeros((K, N, 3)) for name in ("translation", "velocity", "angular_velocity")},
@@ -86,31 +98,30 @@ def recording_of(dataset: Dataset, variant: Variant, in_space: bool = False) -> 
         "visible": np.zeros((K, N, T), bool),
         "start_covariance": np.zeros((N, 6, 6)),
     }
+    readings = {
+        "range": np.full((K, N, T, 1), np.nan),
+        "level": np.full((K, N, 1, 3), np.nan),
+        "height": np.full((K, N, 1, 3), np.nan),
+    }
+    for name in ("level", "height"):
+        readings[name][1::FLOOR_PERIOD_TICKS] = 0.0
     pose, start = np.zeros((K, N, 3)), np.zeros((N, 3))
     for i, robot in enumerate(dataset.robots):
         held = HeldCommands(robot)
-        reckoned = held.pose(t)
-        turn = np.diff(reckoned[:, 2])
-        arrays["velocity"][:, i, 0], arrays["angular_velocity"][:, i, 2] = held.commands(t)
-        arrays["translation"][1:, i, :2] = _turned(np.diff(reckoned[:, :2], axis=0), -reckoned[:-1, 2])
-        if in_space:
-            turn, path = _response(turn, arrays["translation"][1:, i])
-            arrays["velocity"][1:, i, 0], arrays["angular_velocity"][1:, i, 2] = path / TICK_S, turn / TICK_S
-            arrays["translation"][1:, i, :2] = arc(np.zeros_like(turn), path, turn)
+        turn, path = _motion(held, t)
+        arrays["velocity"][1:, i, 0], arrays["angular_velocity"][1:, i, 2] = path / TICK_S, turn / TICK_S
+        arrays["translation"][1:, i, :2] = arc(np.zeros_like(turn), path, turn)
         arrays["rotation"][1:, i] = about_z(turn)
-        k, seen, vectors = _seen(robot, variant, held, t)
+        k, seen, vectors, ranges = _seen(robot, variant, held, t)
+        readings["range"][k, i, column[seen], 0] = ranges
         arrays["bearings"][k, i, column[seen]], arrays["visible"][k, i, column[seen]] = vectors, True
         pose[:, i] = _truth(robot, held, t)
         start[i], arrays["start_covariance"][i] = _start(robot, held, pose[:, i], t)
     points = np.array([[*dataset.landmarks[subject], 0.0] for subject in sorted(dataset.landmarks)])
-    if in_space:
-        points = np.vstack([points, ZENITH])
-        arrays["bearings"][1::ZENITH_PERIOD_TICKS, :, L - 1] = (0.0, 0.0, 1.0)
-        arrays["visible"][1::ZENITH_PERIOD_TICKS, :, L - 1] = True
     arrays["landmarks"] = np.broadcast_to(points, (K, L, 3))
     arrays["start_rotation"], arrays["start_position"] = about_z(start[:, 2]), np.insert(start[:, :2], 2, 0.0, axis=1)
     recording = Recording(
-        setups=_setups(sorted(dataset.landmarks), in_space),
+        setups=_setups(sorted(dataset.landmarks)),
         order=tuple(range(N)),
         dt=TICK_S,
         inbox_tick=received_by_all(K, N, MESSAGE_PERIOD_TICKS),
@@ -118,14 +129,15 @@ def recording_of(dataset: Dataset, variant: Variant, in_space: bool = False) -> 
         staleness=math.inf,
         due=np.ones(K, bool),
         truth=Truth(about_z(pose[..., 2]), np.concatenate([pose[..., :2], 0.0 * pose[..., :1]], axis=-1)),
+        readings=readings,
         **arrays,
     )
     check_recording(recording, dataset.name)
     return recording
 
 
-def _setups(subjects: list[int], in_space: bool) -> tuple[Setup, ...]:
-    known = [f"landmark_{s}" for s in subjects] + ["zenith"] * in_space
+def _setups(subjects: list[int]) -> tuple[Setup, ...]:
+    known = [f"landmark_{s}" for s in subjects]
     names, landmarks = (*known, *(f"vehicle_{s}" for s in ROBOTS)), len(known)
     k, q, V, P0, max_turn = GAINS
     gains = Gains(k, np.full(len(names), q), V, P0, max_turn)
@@ -138,28 +150,30 @@ def _setups(subjects: list[int], in_space: bool) -> tuple[Setup, ...]:
             targets=np.delete(np.arange(len(names)), landmarks + i),
             lever_arm=np.zeros(3),
             marker=np.zeros(3),
-            noise=SPATIAL_NOISE if in_space else NOISE,
+            noise=NOISE,
             gains=gains,
-            planar=not in_space,
+            sensors=_sensors(np.delete(np.arange(len(names)), landmarks + i)),
         )
         for i, robot in enumerate(ROBOTS)
     )
 
 
-def _response(turn: Array, step: Array) -> tuple[Array, Array]:
-    """Return the turns (K,) rad and paths (K,) m of the robot by its wheels, from the commanded turns and steps.
+def _sensors(targets: NDArray[np.int64]) -> tuple[Sensor, ...]:
+    """Return the sensors of a robot beside its camera, in the body's origin."""
+    place = np.zeros(3), np.eye(3)
+    floor, the_map = np.full(3, FLOOR_STD), np.array([MAP])
+    return (
+        Sensor("range", "range", np.array([RANGE_STD]), targets, *place, std_by_distance=RANGE_STD_BY_DISTANCE),
+        Sensor("level", "attitude", np.where([False, False, True], UNKNOWN_STD, floor), the_map, *place),
+        Sensor("height", "position", np.where([True, True, False], UNKNOWN_STD, floor), the_map, *place),
+    )
 
-    The response is that of `planar_robust` before it has calibrated anything.
-    """
-    turn_scale, speed_scale, turn_offset, speed_offset, slowdown, lead, _, _, _ = CALIBRATING.mean
-    history = CommandHistory(IROBOT_CREATE, lead + TRAPEZOID_S, TICK_S)
-    path = np.copysign(np.hypot(step[:, 0], step[:, 1]), step[:, 0]) / np.sinc(turn / 2 / np.pi)
-    made = np.empty((len(turn), 7))
-    for k, commanded in enumerate(zip(turn.tolist(), path.tolist(), strict=True)):
-        history.add(TICK_S, *commanded)
-        made[k] = history.response(TICK_S, lead + TRAPEZOID_S)[0]
-    turned = turn_scale * (made[:, TURN] - turn_offset * made[:, TURNING])
-    return turned, speed_scale * made[:, PATH] + speed_offset * made[:, ARC] - slowdown * made[:, SLOWING]
+
+def _motion(held: HeldCommands, t: Array) -> tuple[Array, Array]:
+    """Return the turns (K - 1,) rad and paths (K - 1,) m between ticks, by the nominal calibration of commands."""
+    turn, path = np.diff(held.sums(t - LEAD_S), axis=0).T
+    straight = np.where(path == 0.0, 0.0, STRAIGHT_RATE * TICK_S)
+    return TURN_SCALE * (turn - straight), SPEED_SCALE * path * (1.0 - TURNING_LOSS * np.abs(turn) / TICK_S)
 
 
 def counted(robot: Robot, variant: Variant) -> NDArray[np.bool_]:
@@ -173,15 +187,17 @@ def counted(robot: Robot, variant: Variant) -> NDArray[np.bool_]:
     return keep
 
 
-def _seen(robot: Robot, variant: Variant, held: HeldCommands, t: Array) -> tuple[NDArray[Any], NDArray[Any], Array]:
+def _seen(
+    robot: Robot, variant: Variant, held: HeldCommands, t: Array
+) -> tuple[NDArray[Any], NDArray[Any], Array, Array]:
     """Return of what one robot's camera saw the ticks (n,), the subjects (n,), and unit vectors (n, 3)."""
-    time, who, _, angle = robot.detections[counted(robot, variant)].T
+    time, who, distance, angle = robot.detections[counted(robot, variant)].T
     k = np.maximum(np.searchsorted(t, time), 1)
     inside = k < len(t)
     k = k[inside]
     beta = angle[inside] - (held.pose(t[k]) - held.pose(time[inside]))[:, 2]
     vectors = np.array([(math.cos(b), math.sin(b), 0.0) for b in beta.tolist()]).reshape(-1, 3)
-    return k, who[inside].astype(np.int64), vectors
+    return k, who[inside].astype(np.int64), vectors, distance[inside]
 
 
 def _truth(robot: Robot, held: HeldCommands, t: Array) -> Array:

@@ -21,14 +21,15 @@ focal length are left out: with them the bound would be higher.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from coopenv.estimation.poses import Array, skew
-from coopenv.measurements.kinds import Placed
-from coopenv.measurements.sensor import MAP, Sensor, landmark_place
+from coopenv.measurements.kinds import Landmarks, Placed
+from coopenv.measurements.sensor import COMPARED_AT, MAP, LinearRows, Sensor, landmark_place
 from coopenv.observers.recording import Recording
 
 ERRORS = 11
@@ -235,10 +236,7 @@ def _add_readings(
 ) -> None:
     """Add the information of what a sensor of vehicle i has measured of one target to M (k, wN, wN)."""
     truth, L = recording.truth, recording.landmarks.shape[1]
-    values = recording.readings[sensor.name][at, i, max(target, 0)]
-    R, p = truth.rotation[at, i], truth.position[at, i]
-    own = sensor.placed(R, p, recording.velocity[at, i], recording.angular_velocity[at, i])
-    linear = sensor.linearised(R, own, _place_of(recording, at, target), values)
+    linear, _ = _linear_rows(recording, at, i, sensor, target)
     weight = np.where(linear.used, 1.0 / linear.noise, 0.0)[..., None]
     blocks = [(slice(w * i, w * i + 6), linear.by_own)]
     if joint and target >= L:
@@ -249,6 +247,40 @@ def _add_readings(
     for rows, first in blocks:
         for columns, second in blocks:
             M[:, rows, columns] += np.swapaxes(first, -1, -2) @ (weight * second)
+
+
+def _linear_rows(recording: Recording, at: Any, i: int, sensor: Sensor, target: int) -> tuple[LinearRows, Array]:
+    """Return the measurements of a target by a sensor of vehicle i, linearised at the truth, and distances (k,), m."""
+    values = recording.readings[sensor.name][at, i, max(target, 0)]
+    R, p = recording.truth.rotation[at, i], recording.truth.position[at, i]
+    marks = Landmarks(zip(recording.setups[i].target_names, np.swapaxes(recording.landmarks[at], 0, 1), strict=False))
+    own = sensor.placed(R, p, recording.velocity[at, i], recording.angular_velocity[at, i], marks)
+    place = _place_of(recording, at, target)
+    distance = (
+        np.linalg.norm(place.position - own.position, axis=-1) if target != MAP else np.full(len(at), COMPARED_AT)
+    )
+    return sensor.linearised(R, own, place, values), distance
+
+
+def relative_information(recording: Recording) -> Array:
+    """Return (K, N, 6, 6) the information of sensors beside the cameras in the Gramian, map axes, about its origin.
+
+    Neighbours count as known. A row counts by the ratio of the error across of the camera's bearing, at the distance of
+    the target, to its own.
+    """
+    at, M = np.arange(recording.ticks), np.zeros((recording.ticks, len(recording.setups), 6, 6))
+    for i, setup in enumerate(recording.setups):
+        for sensor in setup.sensors:
+            for target in sensor.targets.tolist():
+                linear, distance = _linear_rows(recording, at, i, sensor, target)
+                ratio = np.nan_to_num(setup.noise.bearing_std * distance)[:, None] / np.sqrt(linear.noise)
+                rows = np.where(linear.used, ratio, 0.0)[..., None] * linear.by_own
+                M[:, i] += np.swapaxes(rows, -1, -2) @ rows
+    R_t = np.nan_to_num(np.swapaxes(recording.truth.rotation, -1, -2))
+    to_body = np.zeros_like(M)  # turn and shift of the map about its origin as a left error
+    to_body[..., :3, :3] = to_body[..., 3:, 3:] = R_t
+    to_body[..., 3:, :3] = -R_t @ skew(np.nan_to_num(recording.truth.position))
+    return np.asarray(np.swapaxes(to_body, -1, -2) @ M @ to_body)
 
 
 def _place_of(recording: Recording, at: Array, target: int) -> Placed:

@@ -6,6 +6,7 @@ in the BODY frame (the paper's g_ij is the negative).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from math import isfinite
 from operator import index
 from typing import Any, Protocol, runtime_checkable
@@ -18,6 +19,7 @@ from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.sections import LARGEST
 from coopenv.estimation.poses import Array, Coordinates
 from coopenv.estimation.validity import MAX_BEND, MOST_LOPSIDED, are_rotations
+from coopenv.measurements.kinds import Landmarks
 from coopenv.measurements.sensor import Reading, Sensor
 
 BYTES_PER_NUMBER = 8
@@ -48,6 +50,11 @@ class SensorNoise:
     camera_position: float = 0.0  # m per axis
     focal_length: float = 0.0  # relative
     clock_offset: float = 0.0  # s, of the vehicle's clock, by which its messages are dated
+    turn_scale: float = 0.0
+    """From here on lasting errors of odometry that is the commands of a vehicle: of the rate of turn, relative."""
+    curvature: float = 0.0  # rad/m, by which the vehicle turns while it is to drive straight
+    turning_loss: float = 0.0  # s/rad, the share of its speed that the vehicle loses per rate of turn
+    odometry_lead: float = 0.0  # s, by which odometry is ahead of the motion
     velocity_by_speed: float = 0.0  # m/s per m/s
     angular_velocity_by: tuple[float, float] = (0.0, 0.0)  # rad/s per m/s, and rad/s per rad/s
     """Additional noise of a moving vehicle's odometry samples, proportional to its motion."""
@@ -201,6 +208,12 @@ class Tick:
     due: bool = True  # whether the scenario's observer rate (`rates.observer`) asks for a correction at this frame
     readings: tuple[Reading, ...] = ()  # of the sensors beside the camera, in the order of `Setup.sensors`
     landmark_rotation: Array | None = None  # as in `Setup`
+    landmark_names: tuple[str, ...] = ()  # (L,) of the landmarks, or empty
+
+    @cached_property
+    def landmarks_by_name(self) -> Landmarks:
+        """Positions (3,) of the landmarks that have names, map frame, m."""
+        return Landmarks(zip(self.landmark_names, self.landmarks, strict=False))
 
     def usable(self) -> list[tuple[int, Array, Array, Message | None]]:
         """Return (target, bearing, position, message) of every measured target with a known or received position.

@@ -227,22 +227,22 @@ PLACES = types.Array(types.int64, 1, "A", readonly=True)
 
 @compiled(MATRICES, MATRICES, MATRIX, MATRICES, PLACES)
 def joint_jacobian(H: Array, G: Array, recentring: Array, turns: Array, places: Any) -> Array:
-    """Return (rm, 6 + 6k) the derivative of m measurements by the own error and those of k neighbours' places.
+    """Return (rm, n + 6k) the derivative of m measurements by the own error and those of k neighbours' places.
 
     Args:
-        H: (m, r, 6) by the error about where it is linearised.
+        H: (m, r, n) by the error about where it is linearised.
         G: (m, r, 3) by the points, map axes.
-        recentring: (6, 6) of the own error.
+        recentring: (n, n) of the own error.
         turns: (k, 3, 3) the neighbours' orientations.
         places: (m,) the neighbour of each bearing, -1: none.
     """
-    r = H.shape[1]
-    whole = np.zeros((r * len(H), 6 + 6 * len(turns)))
+    r, own = H.shape[1:]
+    whole = np.zeros((r * len(H), own + 6 * len(turns)))
     for n in range(len(H)):
         place(whole, r * n, 0, product(H[n], recentring))
         k = places[n]
         if k >= 0:
-            place(whole, r * n, 6 * k + 9, product(G[n], turns[k]))
+            place(whole, r * n, own + 6 * k + 3, product(G[n], turns[k]))
     return whole
 
 

@@ -38,6 +38,7 @@ Frame = tuple[Array, Array, Array, Array, float]
 
 CAMERA = -1  # in place of the number of a sensor
 BEARING_ROWS, MOST_VALUES = 2, 6
+UNKNOWN_ANGLE = 0.5  # rad, a standard deviation from which on a sensor does not measure an angle
 
 
 def measured_message(tick: Tick) -> Message:
@@ -48,7 +49,7 @@ def measured_message(tick: Tick) -> Message:
 
 
 class OtherMeasurements(NamedTuple):
-    """What measurements of a frame have beside bearings; m entries, of which those of the camera are not read."""
+    """Entries of the measurements of a frame beside bearings, m of each; those of the camera are not read."""
 
     sensor: NDArray[np.int64]  # (m,) its number among the vehicle's sensors, or CAMERA
     values: Array  # (m, MOST_VALUES)
@@ -98,7 +99,7 @@ class LinearMeasurements(NamedTuple):
     ahead: NDArray[np.bool_]  # (m,) whether the points are ahead along the bearings, and not behind
     turn: Array | None = None  # (m, r, 3) derivative by a turn of the target about its own axes; None: it is zero
     used: NDArray[np.bool_] | None = None  # (m, r) rows that were measured; None: all
-    angles: NDArray[np.bool_] | None = None  # (m, r) rows that are angles; None: all
+    angles: NDArray[np.bool_] | None = None  # (m, r) rows that measure an angle; None: all
     common: Array | None = None  # (m, m, r, r) covariance of the residuals of two measurements of one target, or None
 
     def only(self, kept: NDArray[np.bool_]) -> "LinearMeasurements":
@@ -236,7 +237,8 @@ def linearised(pose: UncertainPose, tick: Tick, measured: UsableMeasurements) ->
     for number, kind in kinds.items():
         rows = np.flatnonzero(measured.others.sensor == number)
         _put(linear, rows, rows_of(pose, tick, measured.only(rows), number), pose, measured)
-        linear.angles[rows, : kind.rows] = [unit == "rad" for unit in kind.units]  # type: ignore[index]
+        angles = np.equal(kind.units, "rad") & (tick.readings[number].sensor.std < UNKNOWN_ANGLE)
+        linear.angles[rows, : kind.rows] = angles  # type: ignore[index]
     return linear._replace(common=_common(linear, measured))
 
 
@@ -244,7 +246,7 @@ def rows_of(pose: UncertainPose, tick: Tick, measured: UsableMeasurements, numbe
     """Return the linearised measurements of one sensor, all of a frame's that are its own."""
     sensor, others = tick.readings[number].sensor, measured.others
     assert others is not None
-    own = sensor.placed(pose.R, pose.p, tick.velocity, tick.angular_velocity)
+    own = sensor.placed(pose.R, pose.p, tick.velocity, tick.angular_velocity, tick.landmarks_by_name)
     target = Placed(measured.positions, others.rotation, others.velocity, np.zeros_like(others.velocity))
     return sensor.linearised(pose.R, own.repeated(len(measured.targets)), target, others.values[:, : sensor.kind.size])
 

@@ -21,7 +21,7 @@ from coopenv.measurements.sensor import MAP
 from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick, check_message
 from coopenv.world.embedded import Embedded, Messages
 from coopenv.world.launch import Launcher, start_warp
-from coopenv.world.model import Precision, entry_struct, mat66d, model_struct, precision
+from coopenv.world.model import PRESCRIBED, STATIC, Precision, entry_struct, mat66d, model_struct, precision
 from coopenv.world.state import SCRATCH, allocate, allocate_state, fields, repeated, state_fields, state_sizes
 from coopenv.world.step import observer_kernels
 from coopenv.world.warp_internals import struct_of
@@ -98,7 +98,10 @@ def _add_sensors(model: Any, setup: Setup, p: Precision) -> None:
     model.sensor = wp.array(entries, dtype=entry_struct(p, "sensor"), device="cpu")
     model.carries = wp.full((N, len(sensors)), 1, dtype=wp.int32, device="cpu")
     model.measures = wp.array(measures, dtype=wp.int32, device="cpu")
-    model.motion.kind = wp.zeros(T, dtype=wp.int32, device="cpu")  # the orientations of moving landmarks are NaN
+    kinds = np.zeros(T, np.int32)
+    if setup.landmark_rotation is not None:
+        kinds[: setup.landmarks] = np.where(np.isfinite(setup.landmark_rotation).all(axis=(1, 2)), STATIC, PRESCRIBED)
+    model.motion.kind = wp.array(kinds, dtype=wp.int32, device="cpu")
 
 
 PRECISION = "float64"
@@ -150,7 +153,8 @@ class KernelObserver:
         s.covariance[...] = np.diag(np.repeat(self.setup.gains.P0, 3))
         s.rotation[:L], s.rotation[L:] = np.eye(3), np.nan
         if self.setup.landmark_rotation is not None:
-            s.rotation[:L] = self.setup.landmark_rotation
+            known = self.setup.landmark_rotation
+            s.rotation[:L] = np.where(np.isfinite(known), known, np.eye(3))
         for truth in (s.position, s.velocity, s.angular_velocity):
             truth[...] = np.nan
         for never in (s.inbox_tick, s.inbox_stamp, s.outbox_tick, s.bearing_tick, s.reading_tick):

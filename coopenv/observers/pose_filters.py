@@ -98,13 +98,17 @@ class Mekf(PoseObserver):
     def take(self, tick: Tick, measured: UsableMeasurements) -> None:
         """Correct by the bearings that pass the gate."""
         if self.gated:
-            linear = linearised(self.state, tick, measured)
+            linear = self.linearised(tick, measured)
             S = self.spread(measured, linear)
             kept = self.gate.passed(tick.time, linear, S)
             if not kept.all():
                 measured = measured.only(kept)
         if len(measured.targets):
             self.correct(tick, measured)
+
+    def linearised(self, tick: Tick, measured: UsableMeasurements) -> LinearMeasurements:
+        """Return the measurements linearised at the estimate."""
+        return linearised(self.state, tick, measured)
 
     def spread(self, measured: UsableMeasurements, linear: LinearMeasurements) -> Array:
         """Return (m, r, r) the covariances of the innovations."""

@@ -19,22 +19,36 @@ broadcast, and the target of a bearing does not receive it: j is considered, and
 Sigma_ij is kept by i and propagated by j's factor.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.estimation.compiled import MATRICES, MATRIX, NUMBER, VECTOR, adjoint, compiled, eliminated, place, product
+from coopenv.estimation.compiled import (
+    MATRICES,
+    MATRIX,
+    NUMBER,
+    VECTOR,
+    WHOLE,
+    adjoint,
+    compiled,
+    congruent,
+    eliminated,
+    place,
+    product,
+)
 from coopenv.estimation.poses import Array, cholesky
 from coopenv.observers.contract import Message, Setup, Tick
 from coopenv.observers.correction import PLACES, Look, Stacked, halfway, halfway_gain, joint_jacobian, joseph
 from coopenv.observers.frame import FRAME, Frame, LinearMeasurements, UsableMeasurements, frame_of, linearised
 from coopenv.observers.pose_filters import Mekf
-from coopenv.observers.uncertain_pose import LEFT, UncertainPose, corrected, increment, recentring, transition
+from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, moved, recentring, transition
 
-IDENTITY = np.eye(6)
+Considered = tuple[Array, Array, Array, Array, Array, float]
+"""Results of `considered`."""
+
 MOST_LOST = 60  # lost messages in a row that a received factor may stand for
 SHRINKING = (0.98, 0.9, 0.7, 0.4, 0.0)
 """Factors on cross-covariances that make the joint covariance positive definite, if the received ones do not."""
@@ -55,6 +69,11 @@ class ConsiderFilter(Mekf):
 
     sends_covariance = True
 
+    @property
+    def covariance(self) -> Array:
+        """(n, n) covariance of the own error: that of the pose, and whatever else a subclass estimates behind it."""
+        return self.state.P
+
     def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
         marker = np.asarray(setup.marker, float)
@@ -65,13 +84,13 @@ class ConsiderFilter(Mekf):
         """Start at a pose that is independent of the other vehicles."""
         super().reset(initial_pose, initial_covariance)
         self.neighbours: dict[int, ConsideredNeighbour] = {}
-        self.factor, self.number = IDENTITY, 0
+        self.factor, self.number = np.eye(len(self.covariance)), 0
 
     def message(self) -> Message:
         """Return the marker's pose and covariance, and the factor since the last message with its number."""
         T = self.to_marker
-        factor = T.dot(self.factor).dot(self.from_marker)
-        self.factor, self.number = IDENTITY, self.number + 1
+        factor = T.dot(self.factor[:6, :6]).dot(self.from_marker)
+        self.factor, self.number = np.eye(len(self.factor)), self.number + 1
         extra = {"factor": factor, "number": np.array([self.number]), **self.extra()}
         position = self.state.p + self.state.R.dot(self.marker)
         return Message(position, self.state.R, T.dot(self.state.P).dot(T.T), extra)
@@ -97,7 +116,7 @@ class ConsiderFilter(Mekf):
 
     def spread(self, measured: UsableMeasurements, linear: LinearMeasurements) -> Array:
         """Return (m, 2, 2) the covariances of the innovations, cross-covariances included."""
-        S = super().spread(measured, linear)
+        S = linear.spread(self.covariance)
         for n, target in enumerate(measured.targets.tolist()):
             if target in self.neighbours:
                 of = self.neighbours[target]
@@ -116,11 +135,11 @@ class ConsiderFilter(Mekf):
             return
         factor = factor.astype(float)
         of, now = self.neighbours.get(target), int(number[0])
-        cross = np.zeros((6, 6)) if of is None else of.cross
+        cross = np.zeros((len(self.covariance), 6)) if of is None else of.cross
         if of is not None and now != of.number:
             lost = max(1, min(now - of.number, MOST_LOST))
             cross = cross.dot(factor.T if lost == 1 else np.linalg.matrix_power(factor, lost).T)
-        cross = bounded(cross, self.state.P, np.asarray(message.covariance, float))
+        cross = bounded(cross, self.covariance, np.asarray(message.covariance, float))
         self.neighbours[target] = ConsideredNeighbour(now, message.rotation, message.covariance, cross)
 
     def fuse(self, tick: Tick, measured: UsableMeasurements, between: Array | None = None) -> float:
@@ -129,22 +148,25 @@ class ConsiderFilter(Mekf):
         `between` (n, n, 6, 6) holds the covariances of the neighbours with each other, in the order of `seen`.
         """
         targets, seen = measured.targets.tolist(), self.seen(measured)
-        of, before = [self.neighbours[t] for t in seen], self.state
+        of = [self.neighbours[t] for t in seen]
         joint = self.joint_covariance(of, between)
         places = np.array([seen.index(t) if t in self.neighbours else -1 for t in targets])
         turns = np.array([one.R for one in of], float).reshape(-1, 3, 3)
-        exact = measured.exact()
-        if measured.others is None:
-            made = considered(before.R, before.p, joint, frame_of(tick, exact), turns, places)
-        else:
-            look = look_with_neighbours(before, tick, exact, turns, places)
-            made = considered_from(before.R, before.p, joint, *halfway(joint, look))
-        R, p, P, carried, crosses, nis = made
+        R, p, P, carried, crosses, nis = self.considered(tick, measured.exact(), joint, turns, places)
         self.state = UncertainPose(LEFT, R, p, P)
         self.propagate_cross_covariances(carried, [t for t in self.neighbours if t not in seen])
         for target, was, cross in zip(seen, of, crosses, strict=True):
             self.neighbours[target] = ConsideredNeighbour(was.number, was.R, was.P, cross)
         return float(nis)
+
+    def considered(
+        self, tick: Tick, measured: UsableMeasurements, joint: Array, turns: Array, places: NDArray[np.int64]
+    ) -> Considered:
+        """Return the correction by measurements of targets without covariances; arguments as for `considered`."""
+        if measured.others is None:
+            return considered(self.state.R, self.state.p, joint, frame_of(tick, measured), turns, places)
+        look = look_with_neighbours(self.state, tick, measured, turns, places)
+        return considered_from(self.state.R, self.state.p, 6, joint, *halfway(joint, look))
 
     def seen(self, measured: UsableMeasurements) -> list[int]:
         """Return the known neighbours among the targets, each once."""
@@ -152,18 +174,18 @@ class ConsiderFilter(Mekf):
 
     def joint_covariance(self, of: Sequence[ConsideredNeighbour], between: Array | None) -> Array:
         """Return the joint covariance of the own error and those of neighbours, which is positive definite."""
-        size = 6 + 6 * len(of)
-        joint = np.zeros((size, size))
-        joint[:6, :6] = self.state.P
+        own = len(self.covariance)
+        size = own + 6 * len(of)
+        joint, alone = np.zeros((size, size)), np.zeros((size, size))
+        joint[:own, :own], alone[:own, :own] = self.covariance, 1.0
         for n, one in enumerate(of):
-            k = slice(6 * n + 6, 6 * n + 12)
-            joint[k, k], joint[:6, k], joint[k, :6] = one.P, one.cross, one.cross.T
+            k = slice(own + 6 * n, own + 6 * n + 6)
+            joint[k, k], joint[:own, k], joint[k, :own], alone[k, k] = one.P, one.cross, one.cross.T, 1.0
             if between is not None:
-                joint[k, 6 : 6 * n + 6] = between[n, :n].transpose(1, 0, 2).reshape(6, -1)
-                joint[6 : 6 * n + 6, k] = joint[k, 6 : 6 * n + 6].T
+                joint[k, own : k.start] = between[n, :n].transpose(1, 0, 2).reshape(6, -1)
+                joint[own : k.start, k] = joint[k, own : k.start].T
         if not of or _has_factor(joint):
             return joint
-        alone = np.kron(np.eye(len(of) + 1), np.ones((6, 6)))
         for factor in SHRINKING:
             shrunk = joint * (alone + factor * (1.0 - alone))
             if _has_factor(shrunk):
@@ -172,9 +194,14 @@ class ConsiderFilter(Mekf):
 
 
 def look_with_neighbours(
-    state: UncertainPose, tick: Tick, measured: UsableMeasurements, turns: Array, places: NDArray[np.int64]
+    state: UncertainPose,
+    tick: Tick,
+    measured: UsableMeasurements,
+    turns: Array,
+    places: NDArray[np.int64],
+    by_constants: Callable[[LinearMeasurements, Array], LinearMeasurements] | None = None,
 ) -> Look:
-    """Return measurements as a function of the errors (6 + 6k,) of the own pose and of those of k neighbours.
+    """Return measurements as a function of the own errors (n + 6k,) and of those of the poses of k neighbours.
 
     Args:
         state: the own pose as predicted.
@@ -182,41 +209,50 @@ def look_with_neighbours(
         measured: its measurements, of targets without covariances.
         turns: (k, 3, 3) the neighbours' orientations.
         places: (m,) the neighbour of each measurement, -1: none.
+        by_constants: adds the derivative by constants behind the own pose, whose errors (n - 6,) it gets; None: n = 6.
     """
 
     def look(at: Array) -> Stacked:
         linear = linearised(state.moved(at[:6], state.P), tick, measured)
-        whole = joint_jacobian(linear.H, linear.G, recentring(LEFT, at[:6]), turns, places)
+        if by_constants is not None:
+            linear = by_constants(linear, at)
+        own = linear.H.shape[-1]
+        recentred = np.eye(own)
+        recentred[:6, :6] = recentring(LEFT, at[:6])
+        whole = joint_jacobian(linear.H, linear.G, recentred, turns, places)
         blocks = whole.reshape(*linear.residual.shape, -1)
         for n, turn in enumerate(() if linear.turn is None else linear.turn):
             if (k := places[n]) >= 0:
-                blocks[n, :, 6 * k + 6 : 6 * k + 9] += turn
+                blocks[n, :, own + 6 * k : own + 6 * k + 3] += turn
         return linear.residual.ravel(), whole, linear.noise()
 
     return look
 
 
-@compiled(MATRIX, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, NUMBER)
+@compiled(MATRIX, VECTOR, WHOLE, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, NUMBER)
 def considered_from(
-    R: Array, p: Array, joint: Array, K: Array, whole: Array, N: Array, dx: Array, nis: float
-) -> tuple[Array, Array, Array, Array, Array, float]:
-    """Return the results of `considered` from a gain K (n, k), derivatives (k, n), noise N (k, k) and dx (n,)."""
+    R: Array, p: Array, own: int, joint: Array, K: Array, whole: Array, N: Array, dx: Array, nis: float
+) -> Considered:
+    """Return the results of `considered` from a gain K (n, k), derivatives (k, n), noise N (k, k) and dx (n,).
+
+    The first `own` errors are corrected: those of the pose and, behind them, constants, whose errors add up.
+    """
     K = K.copy()
-    K[6:] = 0.0
+    K[own:] = 0.0
     after = joseph(joint, K, whole, N)
-    R, p, P = corrected(LEFT, R, p, dx[:6], after[:6, :6])
-    recentred = recentring(LEFT, dx[:6])
-    carried = eliminated(joint[:6, :6], product(after[:6, :6], recentred.T)).T
-    crosses = np.empty((len(joint) // 6 - 1, 6, 6))
+    R, p = moved(LEFT, R, p, dx[:6])
+    recentred = np.eye(own)
+    place(recentred, 0, 0, recentring(LEFT, dx[:6]))
+    P = congruent(recentred, after[:own, :own])
+    carried = eliminated(joint[:own, :own], product(after[:own, :own], recentred.T)).T
+    crosses = np.empty(((len(joint) - own) // 6, own, 6))
     for n in range(len(crosses)):
-        place(crosses[n], 0, 0, product(recentred, after[:6, 6 * n + 6 : 6 * n + 12]))
+        place(crosses[n], 0, 0, product(recentred, after[:own, own + 6 * n : own + 6 * n + 6]))
     return R, p, P, carried, crosses, nis
 
 
 @compiled(MATRIX, VECTOR, MATRIX, FRAME, MATRICES, PLACES)
-def considered(
-    R: Array, p: Array, joint: Array, frame: Frame, turns: Array, places: Any
-) -> tuple[Array, Array, Array, Array, Array, float]:
+def considered(R: Array, p: Array, joint: Array, frame: Frame, turns: Array, places: Any) -> Considered:
     """Correct the own pose by bearings, linearised half way (correction.py); neighbours are considered (Schmidt).
 
     Args:
@@ -232,15 +268,15 @@ def considered(
         neighbours (k, 6, 6), and r^T S^-1 r at the prediction.
     """
     K, whole, N, dx, nis = halfway_gain(LEFT, R, p, joint, frame, turns, places)
-    return considered_from(R, p, joint, K, whole, N, dx, nis)
+    return considered_from(R, p, 6, joint, K, whole, N, dx, nis)
 
 
 @compiled(MATRIX, MATRIX, MATRIX)
 def bounded(cross: Array, P: Array, of: Array) -> Array:
-    """Return (6, 6) a received cross-covariance, clipped to correlations of at most 1."""
-    result = np.zeros((6, 6))
-    for i in range(6):
-        for j in range(6):
+    """Return a cross-covariance (n, m), clipped to correlations of at most 1."""
+    result = np.zeros(cross.shape)
+    for i in range(len(P)):
+        for j in range(len(of)):
             limit = np.sqrt(max(P[i, i] * of[j, j], 0.0))
             if not np.isnan(cross[i, j]):
                 result[i, j] = min(max(cross[i, j], -limit), limit)
@@ -265,7 +301,7 @@ class SchmidtKalman(ConsiderFilter):
         """Return pose, covariance and factor, and the cross-covariances with the neighbours."""
         report = super().message()
         targets = sorted(self.neighbours)
-        cross = np.array([self.to_marker.dot(self.neighbours[t].cross) for t in targets]).reshape(-1, 6, 6)
+        cross = np.array([self.to_marker.dot(self.neighbours[t].cross[:6]) for t in targets]).reshape(-1, 6, 6)
         extra: dict[str, Array] = {**report.extra, "targets": np.array(targets, float), "cross": cross}
         return Message(report.position, report.rotation, report.covariance, extra)
 

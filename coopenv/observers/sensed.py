@@ -115,6 +115,7 @@ class Sensed(Measurements):
             due=self.due,
             readings=tuple(self.reading(setup, sensor) for sensor in setup.sensors),
             landmark_rotation=setup.landmark_rotation,
+            landmark_names=setup.target_names[: setup.landmarks],
         )
 
     def reading(self, setup: Setup, sensor: Sensor) -> Reading:

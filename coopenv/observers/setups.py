@@ -1,4 +1,4 @@
-"""What every vehicle of a simulated world knows before it starts: sensors, their noise, and the initial estimate."""
+"""Setups: what vehicles of a simulated world know before the start, of sensors, noise and the initial estimate."""
 
 import math
 from collections.abc import Sequence

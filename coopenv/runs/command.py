@@ -21,6 +21,7 @@ from coopenv.episode import OF_TRAJECTORY, RECORDED, SCENE_FILE
 from coopenv.estimation.metrics import shown_note, shown_vehicles, steady_start
 from coopenv.estimation.observability import Observability, analyse_observability
 from coopenv.estimation.trajectory import Trajectory
+from coopenv.measurements.own import SensorError
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import states_covariance, with_observer
 from coopenv.policies import Policy
@@ -68,12 +69,13 @@ def execute(
 ) -> "Results":
     """Run, write to the folder `out` (None: no files), and return what came of it.
 
-    A run that does not reach its end writes nothing to `out`. `figures` is their format; None: no figures. `width` is a
-    column of `coopenv.viz.figures`; None: a page's. `describe` returns the text beside the bar. `check` is called when
-    the run is over, and raises CoopenvError if it is not worth its files.
+    A run that does not reach its end writes nothing to `out`, unless a user's sensor has ended it. `figures` is their
+    format; None: no figures. `width` is a column of `coopenv.viz.figures`; None: a page's. `describe` returns the text
+    beside the bar. `check` is called when the run is over, and raises CoopenvError if it is not worth its files.
 
     Raises:
         CoopenvError: an argument is not valid, or the results cannot be written.
+        SensorError: a user's sensor has failed; the results up to then are written.
     """
     scenario = run.scenario
     if run.policy_name not in ("zero", "recorded") and not scenario.driven:
@@ -88,10 +90,10 @@ def execute(
             run.engine.load()
         stride = frame_stride(scenario)
         with Progress(log, doing, run.ticks_planned, paced) as progress:
-            for tick in run.play(OF_TRAJECTORY if out is None else RECORDED):
-                if tick % stride == 0:
-                    progress.update(tick, describe() if describe is not None else None)
-            if check is not None:
+            failure = _played(run, OF_TRAJECTORY if out is None else RECORDED, stride, progress, describe)
+            if failure is not None and (out is None or run.ticks_recorded < 1):
+                raise failure
+            if check is not None and failure is None:
                 check()
             episode = run.episode(name)
             results, observability = _figures_of(name, overrides, run, episode.trajectory, steady)
@@ -115,7 +117,25 @@ def execute(
                 write_film(top_view_film(scene), paths[-1], fps, width=None, on_progress=progress.update)
             if paths[-1].suffix == ".gif":
                 log.print(f"video: written as GIF; for MP4: {install_command('video')}", soft_wrap=True)
+    if failure is not None:
+        time = run.ticks_recorded / scenario.rates.camera
+        raise CoopenvError(f"{failure} (the {time:g} s before it are in {out})") from failure
     return replace(results, files=tuple(out / path.name for path in paths))
+
+
+def _played(
+    run: Rollout, fields: Sequence[str], stride: int, progress: Progress, describe: Callable[[], str] | None
+) -> CoopenvError | None:
+    """Play a run, and return the error of a user's sensor that has ended it; None: it has reached its end."""
+    try:
+        for tick in run.play(fields):
+            if tick % stride == 0:
+                progress.update(tick, describe() if describe is not None else None)
+    except CoopenvError as error:
+        if not isinstance(error, SensorError) and not isinstance(error.__cause__, SensorError):
+            raise
+        return error
+    return None
 
 
 def _figures_of(

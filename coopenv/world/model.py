@@ -271,7 +271,7 @@ def model_struct(p: Precision) -> Any:
         ratio: wp.float64  # measurements per tick, at most 1
         std: vec6  # of white noise
         counted: vec6  # standard deviations by which filters count its noise
-        weight: vec6  # of rows in the sliding Gramian, relative to a bearing of the camera
+        weight: vec6  # squares of the ratios of the error of a camera's bearing, rad, to those of the rows
         bias: vec6  # standard deviations of an error per vehicle and episode
         correlated: vec6  # standard deviations of a Gauss-Markov process
         correlation: scalar  # of that with itself one tick later

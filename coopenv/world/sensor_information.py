@@ -6,9 +6,12 @@ import warp as wp
 
 from coopenv.measurements.in_warp import first_three, last_three
 from coopenv.measurements.kinds import MOST_ROWS, WarpFunctions
+from coopenv.measurements.sensor import COMPARED_AT
 from coopenv.world.quality import known_position
 from coopenv.world.v2x import fresh
 from coopenv.world.warp_internals import device_function
+
+COMPARED_AT_SQUARE = wp.constant(COMPARED_AT**2)
 
 
 @device_function
@@ -64,7 +67,9 @@ def inform_of(functions: WarpFunctions) -> Any:
     def inform(model: Any, state: Any, world: int, vehicle: int, sensor: int, target: int, tick: int):
         """Add the information of a measurement of a known target at the pose that the odometry predicts.
 
-        As for bearings, the Gramian has ticks of its own, and neighbours count as known.
+        As for bearings, the Gramian has ticks of its own, and neighbours count as known. The rows of a bearing of the
+        camera are not divided by the distance: a row counts by the ratio of that bearing's error across, at the
+        distance of the target, to its own.
         """
         own = model.sensor[sensor]
         if tick % model.observer.gramian_stride != 0:
@@ -79,12 +84,14 @@ def inform_of(functions: WarpFunctions) -> Any:
         z = p - p
         o = p - p
         target_R = R
+        square = p.dtype(COMPARED_AT_SQUARE)
         if own.has_target == 1:
             z = known_position(model, state, world, vehicle, target, target)
             target_R = known_rotation(model, state, world, vehicle, target)
+            square = wp.length_sq(z - p)
         by_own, _ = jacobian(R, p, o, target_R, z, o)
         for row in range(MOST_ROWS):
             if own.weight[row] > p.dtype(0.0):
-                add_information(state, world, vehicle, sensor, by_own[row], own.weight[row], R, p)
+                add_information(state, world, vehicle, sensor, by_own[row], square * own.weight[row], R, p)
 
     return inform

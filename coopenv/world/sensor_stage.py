@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError
-from coopenv.measurements.kinds import MOST_ROWS, Placed
+from coopenv.measurements.kinds import MOST_ROWS, Landmarks, Placed
+from coopenv.measurements.own import SensorError
 from coopenv.measurements.sensor import Sensor
 from coopenv.scenario.sensors import SensorSection
 from coopenv.world.embedded import Nothing
@@ -92,7 +93,7 @@ class SensorStage:
         noise = self._drawn.noise.numpy()[w, i, d, target, : kind.rows].astype(float)
         values = kind.sample(kind.predict(*self._places(w, d, i, target)), noise)
         if not np.isfinite(values).all():
-            raise CoopenvError(f"sensor '{self._sensors[d].reference}': predict: not finite")
+            raise SensorError(f"sensor '{self._sensors[d].reference}': predict: not finite")
         self._state.reading.numpy()[w, i, d, target] = np.pad(values, [(0, 0), (0, MOST_ROWS - kind.size)])
         self._state.reading_tick.numpy()[w, i, d, target] = tick
 
@@ -101,7 +102,7 @@ class SensorStage:
         L, markers = self._model.landmarks, np.array(self._model.scene.marker.numpy(), float)
         R, position, velocity, turning = (np.array(getattr(self._state, name).numpy()[w], float) for name in POSES)
         points = position + (R @ markers[..., None])[..., 0]
-        marks = dict(zip(self._names[:L], points[:L], strict=True))
+        marks = Landmarks(zip(self._names[:L], points[:L], strict=True))
         at = L + i
         own = self._sensors[d].placed(R[at], position[at], velocity[at], turning[at], marks)
         if not self._kinds[d].has_target:

@@ -74,7 +74,7 @@ def sensor_entries(section: SensorSection, scenario: Scenario) -> dict[str, Any]
 
 
 def _weights(section: SensorSection, scenario: Scenario) -> Array:
-    """Return the weights (6,) of rows relative to a bearing of the camera: the ratios of their information."""
+    """Return the squares (6,) of the ratios of the error of a camera's bearing, rad, to those of the rows."""
     bearing = scenario.noise.bearing.scale or Bearing.noise[0]
     return np.pad(np.square(bearing / section.white), (0, MOST_ROWS - len(section.white)))
 

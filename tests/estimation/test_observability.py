@@ -17,8 +17,11 @@ from scipy.spatial.transform import Rotation
 from coopenv.estimation import Sight
 from coopenv.estimation.observability import analyse_observability, convergence_rates, least_mean, slowest_decay
 from coopenv.estimation.trajectory import Trajectory
+from coopenv.observers.bound import relative_information
+from coopenv.runs.recorder import record_episode
 from coopenv.runs.rollouts import rollout
-from coopenv.scenario import load_scenario
+from coopenv.scenario import load_scenario, parse_scenario
+from tests.helpers.builders import circling, raw
 from tests.helpers.env_suite import rest_slow
 from tests.helpers.synthetic import LANDMARKS, NEIGHBOURS, START, VELOCITY, make_trajectory
 from tests.oracles.continuous import skew
@@ -306,3 +309,20 @@ def test_the_least_mean_of_a_ramp() -> None:
     mean, start = least_mean(t, 30.0 - t)
     assert start == pytest.approx(14.75) and mean == pytest.approx(30.0 - 14.75 - 2.5)
     assert np.isnan(least_mean(t[:5], t[:5])).all()
+
+
+def test_a_sensor_of_bearings_counts_as_the_camera_does() -> None:
+    """It sits at the origin of the body and has the noise of the camera."""
+    bearing = {"model": "isotropic", "scale": 0.01, "rate": 60.0}
+    sensor = {"kind": "bearing", "towards": ["landmarks", "vehicles"], "noise": 0.01}
+    given = {"noise": {"bearing": bearing}, "horizon": 1.5, "observer": {"name": "dead_reckoning"}}
+    seen, silent = (
+        record_episode(parse_scenario(raw(circling(), sensors=[sensor], camera=camera, **given), "test"))
+        for camera in ({"orientation": "body"}, {"model": "none"})
+    )
+    more = relative_information(silent.measured)
+    found = analyse_observability(silent.trajectory, more=more)
+    expected = analyse_observability(seen.trajectory)
+    for name in ("min_eigenvalue", "local_eigenvalue"):
+        assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-6, atol=1e-12)
+    assert not analyse_observability(silent.trajectory).local_eigenvalue.any()

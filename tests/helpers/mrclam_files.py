@@ -22,7 +22,7 @@ HEADER = (
 
 def pose(robot: int, t: np.ndarray) -> np.ndarray:
     """Return (N, 3) x, y, heading of a robot on its circle, exactly as v and omega say."""
-    v, omega = command(robot)
+    v, omega = motion(robot)
     heading = 0.6 * robot + omega * t
     radius = v / omega
     x = 0.8 * np.cos(robot) + radius * (np.sin(heading) - np.sin(0.6 * robot))
@@ -30,9 +30,16 @@ def pose(robot: int, t: np.ndarray) -> np.ndarray:
     return np.stack([x, y, (heading + np.pi) % (2 * np.pi) - np.pi], axis=-1)
 
 
-def command(robot: int) -> tuple[float, float]:
+def motion(robot: int) -> tuple[float, float]:
     """Return v m/s and omega rad/s."""
     return 0.1 + 0.01 * robot, 0.1 * (-1) ** robot
+
+
+def command(robot: int) -> tuple[float, float]:
+    """Return the commanded v and omega that the nominal calibration turns into the motion."""
+    v, omega = motion(robot)
+    commanded = omega / 0.93 + 0.006
+    return v / 1.04 / (1.0 - 0.5 * abs(commanded)), commanded
 
 
 def write(parent: Path, number: int = 6, seconds: float = 40.0) -> Path:

@@ -10,13 +10,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import DataError
+from coopenv.measurements.kinds import Placed
 from coopenv.mrclam.dataset import MotionCapture
-from coopenv.mrclam.planar import PlanarEkf, PlanarRobust
-from coopenv.mrclam.recording import DRIFT_STD, MESSAGE_PERIOD_TICKS, START_STD, TICK_S, load_dataset, recording_of
+from coopenv.mrclam.recording import (
+    DRIFT_STD,
+    FLOOR_PERIOD_TICKS,
+    LEAD_S,
+    MESSAGE_PERIOD_TICKS,
+    START_STD,
+    TICK_S,
+    load_dataset,
+    recording_of,
+)
 from coopenv.observers.runner import run
 from coopenv.sources.sources import open_recording
 from tests.helpers.env_suite import rest_slow
-from tests.helpers.mrclam_files import LANDMARKS, command, pose, write
+from tests.helpers.mrclam_files import BARCODES, LANDMARKS, ORIGIN, barrier_robots, motion, pose, write
 
 ORIGIN_S = 0.1  # of the synthetic files: the first odometry sample
 
@@ -36,7 +45,7 @@ def test_names_and_shapes(recording):
     setup = recording.setups[2]
     assert [s.name for s in recording.setups] == [f"vehicle_{n}" for n in range(1, 6)]
     assert setup.target_names == (*(f"landmark_{s}" for s in LANDMARKS), *(f"vehicle_{n}" for n in range(1, 6)))
-    assert setup.planar and setup.landmarks == L and setup.targets.tolist() == [0, 1, 2, 3, 4, 5, 6, 8, 9]
+    assert setup.landmarks == L and setup.targets.tolist() == [0, 1, 2, 3, 4, 5, 6, 8, 9]
     assert recording.bearings.shape == (recording.ticks, 5, L + 5, 3)
     np.testing.assert_allclose(recording.landmarks[7, :, :2], list(LANDMARKS.values()))
     assert recording.ticks * TICK_S == pytest.approx(19.4, abs=0.1)
@@ -121,102 +130,97 @@ def test_a_robot_never_seen_is_an_error(dataset):
 
 
 @pytest.mark.parametrize("variant", rest_slow(["landmarks", "landmarks+robots", "blind"], 1, 2))
-@pytest.mark.parametrize("observer", [PlanarEkf, PlanarRobust])
+@pytest.mark.parametrize("observer", ["mekf_covariance", "self_calibrating"])
 def test_observers_follow_robots_without_noise(dataset, observer, variant):
+    """Robots that move as the nominal calibration says, but set out at once, and not 0.2 s later."""
     result = run(observer, recording_of(dataset, variant))
     assert not result.failure
-    # bearings lag by up to a tick of driving; PlanarRobust expects a lead and gains that these robots do not have
-    assert (result.position_rmse() < (0.02 if observer is PlanarEkf else 0.2)).all()
+    assert (result.position_rmse() < 0.1).all()
     assert (result.anees(after=TICK_S) < 2).all()
 
 
-@pytest.mark.parametrize("observer", ["riccati", "mekf_covariance", "centralised", "dead_reckoning"])
-def test_the_zoo_runs(dataset, observer):
-    result = run(observer, recording_of(dataset, "landmarks+robots"))
-    assert not result.failure
+@pytest.mark.parametrize("observer", ["riccati", "robust", "centralised", "dead_reckoning"])
+def test_the_zoo_runs_and_stays_on_the_plane(dataset, observer):
+    recording = recording_of(dataset, "landmarks+robots")
+    result = run(observer, recording)
+    assert not result.failure and recording.on_a_plane and result.nees_dof == 3
     assert (result.position_rmse() < 0.1).all()
+    assert np.abs(result.position[..., 2]).max() < 1e-3
+    assert np.abs(result.rotation[..., 2, :2]).max() < 1e-3
 
 
-@pytest.fixture(scope="module")
-def spatial(dataset):
-    return recording_of(dataset, "landmarks+robots", in_space=True)
+def test_both_names_open_it(recording, tmp_path):
+    write(tmp_path, seconds=20.0)
+    for name in ("mrclam_6", "mrclam_6_space"):
+        opened = open_recording(name, tmp_path)
+        np.testing.assert_array_equal(opened.translation, recording.translation)
+        np.testing.assert_array_equal(opened.readings["range"], recording.readings["range"])
+    with pytest.raises(DataError, match="unknown data set 'mrclam_0'"):
+        open_recording("mrclam_0_space", tmp_path)
 
 
-class TestInSpace:
-    def test_the_name_opens_it(self, spatial, dataset, tmp_path):
-        opened = open_recording("mrclam_6_space", write(tmp_path, seconds=20.0))
-        np.testing.assert_array_equal(opened.translation, spatial.translation)
-        assert opened.setups[0].target_names == spatial.setups[0].target_names
-        with pytest.raises(DataError, match="unknown data set 'mrclam_0'"):
-            open_recording("mrclam_0_space", tmp_path)
+def test_ranges_are_those_of_the_files(tmp_path):
+    """Every row of a robot's file is a range at the next tick, towards the target of the barcode."""
+    folder = write(tmp_path, seconds=20.0)
+    recording = recording_of(load_dataset("mrclam_6", tmp_path), "landmarks+robots")
+    subjects = {barcode: subject for subject, barcode in BARCODES.items()}
+    rows = np.loadtxt(folder / "Robot3_Measurement.dat")
+    expected = {}
+    for time, barcode, distance, _ in rows:
+        k = math.ceil((time - ORIGIN - ORIGIN_S) / TICK_S - 1e-4)
+        expected[k, recording.setups[2].target_names.index(named(subjects[int(barcode)]))] = distance
+    ranges = recording.readings["range"][:, 2, :, 0]
+    assert len(expected) > 50 and len(expected) == np.isfinite(ranges).sum()
+    for (k, target), distance in expected.items():
+        assert ranges[k, target] == distance
+    assert np.array_equal(np.isfinite(ranges), recording.visible[:, 2])
 
-    def test_measurements_are_those_of_the_plane_and_the_zenith(self, recording, spatial):
-        L = len(LANDMARKS)
-        names = list(spatial.setups[0].target_names)
-        assert names.pop(L) == "zenith" and tuple(names) == recording.setups[0].target_names
-        np.testing.assert_array_equal(np.delete(spatial.bearings, L, axis=2), recording.bearings)
-        np.testing.assert_array_equal(np.delete(spatial.visible, L, axis=2), recording.visible)
-        np.testing.assert_array_equal(spatial.inbox_tick, recording.inbox_tick)
-        assert spatial.visible[:, 3, L].sum() == math.ceil((spatial.ticks - 1) * TICK_S / 2.0)
-        assert (spatial.bearings[spatial.visible[:, 3, L], 3, L] == (0.0, 0.0, 1.0)).all()
-        for i, setup in enumerate(spatial.setups):
-            assert not setup.planar and setup.targets.tolist() == np.delete(np.arange(L + 6), L + 1 + i).tolist()
 
-    def test_odometry_is_what_the_wheels_make_of_commands(self, spatial):
-        """Once a command has been held for a while, with the gain at its curvature."""
-        for i in range(5):
-            v, w = command(i + 1)
-            gain = np.interp(abs(w - 0.005) / v, [0.35, 0.8, 1.6], [1.3, 0.88, 0.84])
-            turn, speed = 0.936 * gain * (w - 0.005), v + 0.004 - v * abs(w)
-            assert spatial.angular_velocity[200, i, 2] == pytest.approx(turn, rel=1e-6)
-            assert spatial.velocity[200, i, 0] == pytest.approx(speed, rel=1e-6)
-            turned = Rotation.from_matrix(spatial.rotation[200, i]).as_rotvec()
-            np.testing.assert_allclose(turned, [0, 0, turn * TICK_S], atol=1e-9)
-            chord = 2 * speed / turn * math.sin(turn * TICK_S / 2)
-            half = turn * TICK_S / 2
-            np.testing.assert_allclose(
-                spatial.translation[200, i], [chord * math.cos(half), chord * math.sin(half), 0.0], atol=1e-9
-            )
+def named(subject):
+    return f"vehicle_{subject}" if subject <= 5 else f"landmark_{subject}"
 
-    def test_wheels_are_late(self, dataset):
-        """A robot that is sent off at 5 s starts 0.175 s later, and is at its speed 0.4 s after that."""
-        robots = list(dataset.robots)
-        odometry = robots[0].odometry.copy()
-        odometry[odometry[:, 0] < 5.0, 1:] = 0.0
-        robots[0] = replace(robots[0], odometry=odometry)
-        r = recording_of(replace(dataset, robots=tuple(robots)), "landmarks", in_space=True)
-        assert not r.translation[r.t < 5.15, 0].any() and r.translation[r.t > 5.25, 0, 0].min() > 0.0
-        late = r.velocity[r.t > 5.65, 0, 0]
-        assert np.ptp(late) < 1e-9 < late[0] - r.velocity[r.t < 5.45, 0, 0].max()
 
-    def test_noise_is_in_proportion_to_motion(self, tmp_path):
-        """Before the first detection, the variance of a position grows by the square of the speed's noise."""
-        spatial = recording_of(load_dataset("mrclam_6", write(tmp_path, seconds=4.0)), "landmarks", in_space=True)
-        v, noise = spatial.velocity[:, 4, 0], spatial.setups[4].noise
-        still, moving = (noise.moving(np.array([x, 0.0, 0.0]), np.zeros(3)) for x in (0.0, 0.15))
-        assert still == replace(noise) and moving.velocity == pytest.approx(0.02 / math.sqrt(TICK_S), rel=1e-6)
-        assert moving.angular_velocity == pytest.approx(0.023 / math.sqrt(TICK_S), rel=1e-6)
-        k = int(np.flatnonzero(spatial.visible[:, 4, :5].any(axis=1))[0]) - 1
-        expected = START_STD[1] ** 2 + float(((0.002 + 0.12 * v[1 : k + 1]) ** 2).sum()) * TICK_S
-        assert k * TICK_S == pytest.approx(0.95, abs=0.06)
-        for observer in ("robust", "mekf_covariance", "dead_reckoning"):
-            covariance = run(observer, spatial).covariance
-            assert covariance[k, 4, 3, 3] == pytest.approx(expected, rel=0.05), observer
+def test_a_blind_robot_has_no_ranges_to_landmarks(dataset):
+    ranges = recording_of(dataset, "blind").readings["range"]
+    assert not np.isfinite(ranges[:, 2:, : len(LANDMARKS)]).any()
+    assert np.isfinite(ranges[:, :2, : len(LANDMARKS)]).any() and np.isfinite(ranges[:, 2:, len(LANDMARKS) :]).any()
 
-    def test_estimates_stay_on_the_plane_and_are_judged_there(self, spatial, recording):
-        """The robots of the files are no Creates: odometry that turns 12 % too little is off by a decimetre."""
-        assert spatial.on_a_plane and recording.on_a_plane
-        for observer in ("robust", "schmidt_kalman", "centralised"):
-            result = run(observer, spatial)
-            assert not result.failure and result.nees_dof == 3
-            assert (result.position_rmse() < 0.15).all(), observer
-            assert np.abs(result.position[..., 2]).max() < 1e-3
-            assert np.abs(result.rotation[..., 2, :2]).max() < 1e-3
 
-    def test_roll_and_pitch_are_known_without_detections(self, tmp_path):
-        """After 38 s the heading's variance has grown far beyond those of roll and pitch."""
-        dataset = load_dataset("mrclam_6", write(tmp_path))
-        alone = tuple(replace(robot, detections=robot.detections[:0]) for robot in dataset.robots)
-        r = recording_of(replace(dataset, robots=alone), "blind", in_space=True)
-        std = np.sqrt(np.diagonal(run("robust", r).covariance[-1, 3], axis1=0, axis2=1))
-        assert std[0] < 0.06 and std[1] < 0.06 and std[2] > 0.15
+def test_the_floor_is_measured_every_two_seconds(recording):
+    for sensor in recording.setups[0].sensors[1:]:
+        measured = np.isfinite(recording.readings[sensor.name][:, 3, 0, 0])
+        assert np.flatnonzero(measured).tolist() == [*range(1, recording.ticks, FLOOR_PERIOD_TICKS)]
+        assert not recording.readings[sensor.name][measured].any()
+    level, height = (sensor.std for sensor in recording.setups[0].sensors[1:])
+    assert level[:2].max() < 0.1 < 100.0 < level[2] and height[2] < 0.1 < 100.0 < height[:2].min()
+
+
+def test_a_range_is_less_certain_the_farther_the_target():
+    sensor = recording_of(barrier_robots(1, 2.0), "landmarks").setups[0].sensors[0]
+    own = Placed.at(np.zeros((2, 3)))
+    rows = sensor.linearised(np.eye(3), own, Placed.at(np.array([[1.0, 0, 0], [0, 4.0, 0]])), np.array([[1.1], [3.9]]))
+    np.testing.assert_allclose(rows.noise[:, 0], [0.1**2 + 0.15**2, 0.1**2 + 0.6**2])
+
+
+def test_a_command_becomes_motion_later(dataset):
+    """A robot that is sent off at 5 s sets out after the lead of its commands, with the nominal motion."""
+    robots = list(dataset.robots)
+    odometry = robots[0].odometry.copy()
+    odometry[odometry[:, 0] < 5.0, 1:] = 0.0
+    robots[0] = replace(robots[0], odometry=odometry)
+    r = recording_of(replace(dataset, robots=tuple(robots)), "landmarks")
+    v, omega = motion(1)
+    assert not r.translation[r.t < 4.99 + LEAD_S, 0].any() and not r.angular_velocity[r.t < 4.99 + LEAD_S, 0].any()
+    np.testing.assert_allclose(r.velocity[r.t > 5.11 + LEAD_S, 0, 0], v, rtol=1e-6)
+    np.testing.assert_allclose(r.angular_velocity[r.t > 5.11 + LEAD_S, 0, 2], omega, rtol=1e-6)
+    turned = Rotation.from_matrix(r.rotation[200, 0]).as_rotvec()
+    np.testing.assert_allclose(turned, [0, 0, omega * TICK_S], atol=1e-9)
+
+
+def test_roll_and_pitch_are_known_without_detections(tmp_path):
+    """After 38 s the heading's variance has grown far beyond those of roll and pitch."""
+    dataset = load_dataset("mrclam_6", write(tmp_path))
+    alone = tuple(replace(robot, detections=robot.detections[:0]) for robot in dataset.robots)
+    recording = recording_of(replace(dataset, robots=alone), "blind")
+    std = np.sqrt(np.diagonal(run("self_calibrating", recording).covariance[-1, 3], axis1=0, axis2=1))
+    assert std[:2].max() < 0.06 and std[2] > 0.15 and std[5] < 0.05

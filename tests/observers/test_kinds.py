@@ -154,9 +154,7 @@ def test_the_bound_with_a_kind_is_an_information_filter_at_the_truth(base: Recor
 ALL = [{"kind": kind, "noise": noise} for kind, noise in (("range", 0.1), ("position", 1.0), ("attitude", 0.05))]
 
 
-@pytest.mark.parametrize(
-    "name", ["schmidt_kalman", "pairwise", "centralised"]
-)
+@pytest.mark.parametrize("name", ["schmidt_kalman", "pairwise", "centralised"])
 def test_filters_gain_by_sensors_and_stay_consistent(name: str) -> None:
     keys = {**KEYS, "horizon": 6.0}
     alone = recorded("busy_intersection_tracking", [], seed=5, **keys)

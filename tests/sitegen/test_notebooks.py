@@ -14,7 +14,7 @@ nbformat = pytest.importorskip("nbformat", reason="needs the extra 'docs'")
 
 from sitegen import notebooks  # noqa: E402
 
-NAMES = ("first_steps", "own_observer", "train", "logs", "cars")
+NAMES = ("first_steps", "own_observer", "ranges", "train", "logs", "cars")
 
 
 def cells(text: str) -> list[str]:

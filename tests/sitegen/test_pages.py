@@ -134,6 +134,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 PAGES = {
     "tutorials/first_steps.md": [],
     "tutorials/own_observer.md": [pytest.mark.slow],
+    "tutorials/ranges.md": [pytest.mark.slow],
     "tutorials/train.md": [pytest.mark.train, pytest.mark.slow],
     "tutorials/logs.md": [pytest.mark.slow],
     "tutorials/cars.md": [pytest.mark.slow],
@@ -141,6 +142,7 @@ PAGES = {
     "how-to/figures.md": [pytest.mark.slow],
     "how-to/faults.md": [pytest.mark.slow],
     "how-to/batches.md": [],
+    "contributing/sensor.md": [pytest.mark.slow],
 }
 
 

@@ -308,7 +308,10 @@ def test_a_limit_of_nearby_targets_is_refused_with_sensors() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_gramian_has_the_information_of_every_kind(kind: str) -> None:
-    """By differences of the kind's prediction in NumPy, in the error (phi, d) of the map about its origin."""
+    """By differences of the kind's prediction in NumPy, in the error (phi, d) of the map about its origin.
+
+    A row counts by the ratio of the error across of a bearing at the target's distance to its own.
+    """
     sensor = {"kind": kind, "name": "own", "towards": ["landmarks"], "noise": 0.05, **MOUNTING}
     exact = {"initial_estimate": {"orientation_angle": 0.0, "position_radius": 0.0}}
     car = vehicle((1.0, -1.0, 0.5), motion=constant([0.3, 0.0, 0.0], [0.0, 0.0, 0.2]), **exact)
@@ -326,7 +329,19 @@ def test_the_gramian_has_the_information_of_every_kind(kind: str) -> None:
             moved = Placed(own.position + np.cross(turn, own.position) + shift, R @ own.rotation, own.velocity, turn)
             columns.append(made.residual(made.predict(moved, there), value) / 1e-6)
         H = np.stack(columns, axis=-1)
-        expected += H.T @ H * (0.01 / 0.05) ** 2
+        distance = np.linalg.norm(there.position - own.position) if made.has_target else 10.0
+        expected += H.T @ H * (0.01 * distance / 0.05) ** 2
     found = {n: world.view(f"information_{n}")[0, 0, 0] for n in ("11", "12", "22")}
     whole = np.block([[found["11"], found["12"]], [found["12"].T, found["22"]]])
     assert_allclose(whole, expected, atol=2e-5 * max(1.0, np.abs(expected).max()))
+
+
+def test_a_bearing_counts_in_the_gramian_as_one_of_the_camera() -> None:
+    bearing = {"model": "isotropic", "scale": 0.01, "rate": 60.0}
+    given = {"noise": {"enabled": False, "bearing": bearing}, "vehicles": [vehicle()]}
+    sensor = {"kind": "bearing", "towards": ["landmarks"], "noise": 0.01}
+    by_camera, by_sensor = world_of(sensing(**given)), world_of(sensing(sensor, camera={"model": "none"}, **given))
+    for world in (by_camera, by_sensor):
+        world.advance(6)
+    for name in ("gramian_11", "gramian_12", "gramian_22", "gramian_time"):
+        assert_allclose(by_sensor.view(name), by_camera.view(name), atol=2e-3, err_msg=name)

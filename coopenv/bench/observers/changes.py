@@ -22,8 +22,29 @@ if TYPE_CHECKING:
     from coopenv.observers.faults import Interference
     from coopenv.observers.recording import Recording
 
+CAMERA = "camera"
+"""Name of the camera among the sensors."""
 DIRECTION = np.array([0.6, 0.8, 0.0])
 """Direction of a false position, map axes: horizontal, and along no road."""
+
+
+def with_sensors(recording: Recording, names: Iterable[str]) -> Recording:
+    """Keep the measurements of some sensors alone, by their names; the camera's is "camera"."""
+    kept, scenario = set(names), recording.scenario
+    changes: dict[str, Any] = {
+        "setups": tuple(
+            replace(setup, sensors=tuple(sensor for sensor in setup.sensors if sensor.name in kept))
+            for setup in recording.setups
+        ),
+        "readings": {name: values for name, values in recording.readings.items() if name in kept},
+    }
+    if scenario is not None:
+        sections = tuple(section for section in scenario.sensors if section.label in kept)
+        changes["scenario"] = scenario.model_copy(update={"sensors": sections})
+    if CAMERA not in kept:
+        changes["visible"] = np.zeros_like(recording.visible)
+        changes["bearings"] = np.full_like(recording.bearings, np.nan)
+    return replace(recording, **changes)
 
 
 def with_deliveries(recording: Recording, kept: np.ndarray) -> Recording:

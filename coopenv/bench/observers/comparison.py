@@ -18,7 +18,7 @@ from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables
 from coopenv.bench.observers.judge import JudgedRun, Task, judge_all
 from coopenv.bench.observers.rows import EDGES, Leaderboard, checked_edges
-from coopenv.bench.observers.sources import ALL, RecordSource, find_source, variants_of
+from coopenv.bench.observers.sources import ALL, RecordSource, find_source, variants_of, with_sensor_sets
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import available_names, find, list_observers, named, obstacle, portable
 from coopenv.report.notebook import one_line, picture_html, terminal_html
@@ -167,6 +167,7 @@ def compare(
     robots: Sequence[str | int] | None = None,
     faults: Sequence[str] = (),
     policy: str | None = None,
+    sensors: bool = False,
     jobs: int = 1,
 ) -> Comparison:
     """Compare observers on the same records.
@@ -192,6 +193,7 @@ def compare(
         robots: recorded robots that are used, by name or number; None: all.
         faults: further variants with parameters, such as "vehicle_2:lie=drift:0.05@10", see docs/observers.md.
         policy: agent or policy that drives in the records of an environment; None: action zero.
+        sensors: also compare with the camera alone, each other sensor alone, the camera with each, and all of them.
         jobs: processes. More than one need a script whose own work stands below `if __name__ == "__main__":`, and
             classes that a module or file holds.
 
@@ -201,6 +203,7 @@ def compare(
     if isinstance(environment, str) and environment in list_observers():
         raise CoopenvError(f"compare: environment '{environment}' is an observer; observers come first")
     source = find_source(environment, overrides, data, topics, faults, policy, Selection.of(start, until, robots))
+    source = with_sensor_sets(source) if sensors else source
     plan = Plan.of(observers, source, seeds, variants, steady_from, windows)
     plan.source.check()
     with Progress(Terminal(stderr=True), plan.work, total=1.0) as progress:
@@ -289,7 +292,13 @@ class Plan:
         samples = sorted(chain(*judged), key=lambda sample: order.index((sample.variant, sample.observer)))
         summaries = {variant: self.source.variants[variant] for variant in self.variants}
         return Comparison(
-            self.source.name, self.observers, summaries, self._used, samples, recorded=self.source.recorded
+            self.source.name,
+            self.observers,
+            summaries,
+            self._used,
+            samples,
+            recorded=self.source.recorded,
+            sensor_sets=self.source.sensor_sets,
         )
 
 

@@ -29,6 +29,7 @@ from coopenv.bench.observers.changes import (
     with_prior_error,
     with_random_bearings,
     with_scale_drift,
+    with_sensors,
     with_wrong_association,
     without_landmarks,
 )
@@ -202,11 +203,13 @@ class FaultVariant:
     faults: tuple[Fault, ...] = ()
     scenario: Scenario | None = None
     """The world with the faults that are keys of a scenario; None: there are none."""
+    sensors: tuple[str, ...] | None = None
+    """Names of the only sensors that measure, "camera" among them or not; None: all."""
 
     @property
     def summary(self) -> str:
         """Its faults in words."""
-        words = []
+        words = [] if self.sensors is None else [f"measurements of {' and '.join(self.sensors)} alone"]
         for fault in self.faults:
             kind = FAULTS[fault.name]
             meaning = kind.meaning.partition(": ")[0]
@@ -215,6 +218,8 @@ class FaultVariant:
 
     def applied(self, recording: Recording, seed: int) -> Recording:
         """Return the changed record; `recording` is of the variant's scenario."""
+        if self.sensors is not None:
+            recording = with_sensors(recording, self.sensors)
         for fault in self.faults:
             kind, end = FAULTS[fault.name], float(recording.t[-1])
             if fault.start_in(end) > end:

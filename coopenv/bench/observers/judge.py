@@ -28,7 +28,7 @@ from coopenv.estimation.metrics import (
 from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.poses import Array
 from coopenv.estimation.trajectory import RecordedGeometry
-from coopenv.observers.bound import Bound, cramer_rao, cramer_rao_ancestors
+from coopenv.observers.bound import Bound, cramer_rao, cramer_rao_ancestors, relative_information
 from coopenv.observers.contract import Factory
 from coopenv.observers.isolation import started
 from coopenv.observers.recording import Recording
@@ -158,7 +158,8 @@ def scene_of(recording: Recording, steady_from: float, edges: Sequence[float] = 
         means = [[mean_or_nan(of.position[chosen] ** 2) for chosen in ticks] for of in bounds]
         within = np.array(means).swapaxes(1, 2)
     if known:
-        seen = analyse_observability(_geometry(recording))
+        more = relative_information(recording) if recording.readings else None
+        seen = analyse_observability(_geometry(recording), more=more)
         gramians = np.array([v.min(axis=0, initial=np.inf) for v in (seen.min_eigenvalue, seen.local_eigenvalue)])
     paper_noise = any(setup.noise.image_axis is not None for setup in recording.setups)
     judged = judged_vehicles(recording) & ~out
@@ -207,9 +208,11 @@ def _bounds(recording: Recording) -> list[Bound]:
 def _fingerprint(recording: Recording) -> bytes:
     """Return a digest of everything that bounds depend on: truth, visibility, noise, and what is known at the start."""
     r = recording
-    setups = [(s.noise, s.landmarks, s.targets, s.marker, s.lever_arm) for s in r.setups]
+    setups = [(s.noise, s.landmarks, s.targets, s.marker, s.lever_arm, s.sensors) for s in r.setups]
     arrays = (r.truth.rotation, r.truth.position, r.visible, r.landmarks, r.due, r.start_covariance)
-    return sha256(pickle.dumps((r.dt, setups, arrays))).digest()
+    measured = {name: np.isfinite(values).all(axis=-1) for name, values in r.readings.items()}
+    twists = (r.velocity, r.angular_velocity) if r.readings else ()  # by which the bound moves sensors
+    return sha256(pickle.dumps((r.dt, setups, arrays, measured, twists))).digest()
 
 
 RELATIVE_DELTA = 1.0  # s between the poses of a pair of the relative trajectory error

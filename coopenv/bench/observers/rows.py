@@ -349,6 +349,8 @@ class Leaderboard:
     """True if all seeds have the same recording and draw the initial estimates only."""
     draws: Sequence[Draw] = field(default=(), repr=False)
     """Draws of initial estimates, by observer, where basins were studied."""
+    sensor_sets: tuple[str, ...] = ()
+    """Variants in which some sensors alone measure."""
 
     @property
     def sampled(self) -> str:

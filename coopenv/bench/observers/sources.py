@@ -15,9 +15,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError, DataWarning, suggest
+from coopenv.base.errors import CoopenvError, DataWarning, listed, suggest
 from coopenv.base.plugins import call
-from coopenv.bench.observers.changes import NO_FOLLOWERS, leaders_of
+from coopenv.bench.observers.changes import CAMERA, NO_FOLLOWERS, leaders_of
 from coopenv.bench.observers.faults import (
     NOMINAL,
     VARIANTS,
@@ -67,6 +67,11 @@ class RecordSource(ABC):
     def variants(self) -> dict[str, str]:
         """All variants, with a description each."""
         return {**self.named, **{variant.name: variant.summary for variant in self.added}}
+
+    @property
+    def sensor_sets(self) -> tuple[str, ...]:
+        """Names of the variants in which some sensors alone measure."""
+        return tuple(variant.name for variant in self.added if variant.sensors is not None)
 
     def fault(self, variant: str) -> FaultVariant:
         """Return the faults of a variant."""
@@ -296,15 +301,40 @@ def find_source(
     return GivenRecord(path.stem, path, selection, added=added)
 
 
+def with_sensor_sets(source: RecordSource) -> RecordSource:
+    """Return a source with a variant for the camera, for each other sensor, for the camera with each, and for all.
+
+    Raises:
+        CoopenvError: there is no sensor beside the camera, or the source has variants of its own.
+    """
+    world = source.world()
+    if source.named is not RecordSource.named:
+        raise CoopenvError(f"--sensors: {source.name} has variants of its own, {listed([*source.named])}")
+    if isinstance(world, Recording):
+        names = [*dict.fromkeys(sensor.name for setup in world.setups for sensor in setup.sensors)]
+        camera = bool(world.visible.any())
+    else:
+        names = [section.label for section in world.sensors]
+        camera = any(section.model != "none" for section in world.cameras)
+    if not names:
+        raise CoopenvError(f"--sensors: {source.name} has no [[sensors]] beside the camera")
+    sets = [(CAMERA,), *((name,) for name in names), *((CAMERA, name) for name in names), (CAMERA, *names)]
+    if not camera:
+        sets = [*((name,) for name in names), tuple(names)]
+    made = (FaultVariant("+".join(one), sensors=one) for one in dict.fromkeys(sets))
+    return replace(source, added=(*source.added, *made))
+
+
 def variants_of(source: RecordSource, asked: str | Iterable[str] | None) -> tuple[str, ...]:
     """Return the variants to run: names (a text has commas between), `all` that there can be, or None for the usual.
 
     Raises:
         CoopenvError: there is none of that name, or the source cannot have it.
     """
-    given = source.usual if asked is None else asked.split(",") if isinstance(asked, str) else asked
+    usual = () if source.sensor_sets else source.usual  # the last of these sets is all sensors
+    given = usual if asked is None else asked.split(",") if isinstance(asked, str) else asked
     names = [name.strip() for name in given]
-    if not names:
+    if not (names or source.sensor_sets):
         raise CoopenvError(f"variants: expected at least one; known: {', '.join((*source.variants, ALL))}")
     if names == [ALL]:
         return tuple(name for name in source.variants if not source.obstacle(name))

@@ -132,7 +132,11 @@ def everything(board: Leaderboard, width: int = WIDTH) -> Iterator[Table | str]:
             yield levels
         yield from window_tables(board, variant, width)
     yield from (f"\n{kind.caveat}" for kind in kinds().values() if set(variants) <= set(kind.variants))
-    if len(variants) > 1:
+    if board.sensor_sets:
+        yield ""
+        yield sensor_table(board)
+        yield "ANEES: of the vehicle whose value is farthest from 1."
+    if len(variants) > len(board.sensor_sets) + 1 or (len(variants) > 1 and not board.sensor_sets):
         yield ""
         yield variant_table(board, "mean RMSE [m]", "rmse", variants)
         if NOMINAL in variants:
@@ -343,6 +347,33 @@ def variant_table(board: Leaderboard, heading: str, column: str, variants: Seque
         cells = [FAILED if bad else in_parentheses(*one) for bad, one in zip(failed, measured, strict=True)]
         table.add(short_name(name), *cells)
     return table
+
+
+def sensor_table(board: Leaderboard) -> Table:
+    """Return position RMSE in m and the worst ANEES of every set of sensors and observer, each set below its bound."""
+    few = len(board.vehicles) <= MOST_COLUMNS
+    headings = [*(_headings(board) if few else ["worst"]), "mean", "ANEES"]
+    table = Table.of_texts(["sensors", "position RMSE [m]"], headings, gap=0)
+    for variant in board.sensor_sets:
+        shown = variant
+        if values := board.bounds_in(variant).get("bound_ancestors_m"):
+            own = [*(values if few else [max(values)]), sum(values) / len(values)]
+            table.add(shown, BOUNDS["bound_ancestors_m"], *(number(value, 3) for value in own), "")
+            shown = ""
+        for name in board.ranked:
+            rows = board.rows_in(variant, name)
+            mean = in_parentheses(*board.totals[variant, name].rmse)
+            found = [*_cells(rows, "position_rmse_m", few), mean, _spread_of(rows, "anees")]
+            failed = any(row.failure for row in rows)
+            table.add(shown, name, *([FAILED] * len(found) if failed else found))
+            shown = ""
+    return table
+
+
+def _spread_of(rows: Sequence[Row], column: str) -> str:
+    """Return the figure of the worst vehicle with its standard error."""
+    found = spread(rows, column)
+    return compact(found.worst, found.error)
 
 
 def failures(rows: Sequence[Row]) -> list[str]:

@@ -47,7 +47,7 @@ HEADINGS = 72  # that are tried for it
 LATE = np.arange(-0.5, 0.51, 0.05)  # s, offsets of motion capture that are tried
 
 
-class Kind(NamedTuple):
+class ParameterKind(NamedTuple):
     """A constant: a deviation from its given value."""
 
     name: str
@@ -58,23 +58,25 @@ class Kind(NamedTuple):
 
 
 PER_CAR = (
-    *(Kind(f"camera.{name}", "deg", 0.2, 1e-6, "camera orientation") for name in ("roll", "pitch", "yaw")),
-    *(Kind(f"camera.{name}", "m", 0.3, 1e-6, "camera position") for name in "xyz"),
-    *(Kind(f"camera.{name}", "px", 40.0, 1e-4, "focal length") for name in ("fx", "fy")),
-    *(Kind(f"camera.{name}", "px", 40.0, 1e-4, "principal point") for name in ("cx", "cy")),
-    *(Kind("camera.", "", 0.0, 1e-7, "lens distortion") for _ in range(max(COEFFICIENTS))),  # by the model of the lens
-    Kind("wheel.scale", "", 0.15, 1e-7, "wheel scale"),
-    Kind("gyro.bias", "rad/s", 0.1, 1e-7, "gyro bias"),
-    Kind("camera.offset", "s", 0.5, 1e-5, "stamps"),
-    Kind("wheel.offset", "s", 0.05, 1e-5, "stamps"),
-    Kind("truth.offset", "s", 0.5, 1e-5, "stamps"),
-    Kind("truth.body_yaw", "deg", 0.2, 1e-6, "body of motion capture"),
-    *(Kind(f"truth.body_{axis}", "m", 0.1, 1e-6, "body of motion capture") for axis in "xy"),
+    *(ParameterKind(f"camera.{name}", "deg", 0.2, 1e-6, "camera orientation") for name in ("roll", "pitch", "yaw")),
+    *(ParameterKind(f"camera.{name}", "m", 0.3, 1e-6, "camera position") for name in "xyz"),
+    *(ParameterKind(f"camera.{name}", "px", 40.0, 1e-4, "focal length") for name in ("fx", "fy")),
+    *(ParameterKind(f"camera.{name}", "px", 40.0, 1e-4, "principal point") for name in ("cx", "cy")),
+    *(
+        ParameterKind("camera.", "", 0.0, 1e-7, "lens distortion") for _ in range(max(COEFFICIENTS))
+    ),  # by the model of the lens
+    ParameterKind("wheel.scale", "", 0.15, 1e-7, "wheel scale"),
+    ParameterKind("gyro.bias", "rad/s", 0.1, 1e-7, "gyro bias"),
+    ParameterKind("camera.offset", "s", 0.5, 1e-5, "stamps"),
+    ParameterKind("wheel.offset", "s", 0.05, 1e-5, "stamps"),
+    ParameterKind("truth.offset", "s", 0.5, 1e-5, "stamps"),
+    ParameterKind("truth.body_yaw", "deg", 0.2, 1e-6, "body of motion capture"),
+    *(ParameterKind(f"truth.body_{axis}", "m", 0.1, 1e-6, "body of motion capture") for axis in "xy"),
 )
 """Constants of a car."""
 FRAME = (
-    Kind("truth.frame_yaw", "deg", 0.2, 1e-6, "frame of motion capture"),
-    *(Kind(f"truth.frame_{axis}", "m", 0.3, 1e-6, "frame of motion capture") for axis in "xy"),
+    ParameterKind("truth.frame_yaw", "deg", 0.2, 1e-6, "frame of motion capture"),
+    *(ParameterKind(f"truth.frame_{axis}", "m", 0.3, 1e-6, "frame of motion capture") for axis in "xy"),
 )
 BENT = {"k1": 0.5, "k2": 0.5, "p1": 0.02, "p2": 0.02}
 """Priors of coefficients; 0.2 for all others."""
@@ -131,7 +133,7 @@ class Batch:
                 for kind in PER_CAR
             ),
             *(
-                Kind(f"marker.{name}.{axis}", "m", 0.3, 1e-6, f"marker {name}: position")
+                ParameterKind(f"marker.{name}.{axis}", "m", 0.3, 1e-6, f"marker {name}: position")
                 for name in drive.landmarks
                 for axis in "xyz"
             ),

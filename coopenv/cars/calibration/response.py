@@ -15,7 +15,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import least_squares
 
 from coopenv.base.errors import DataError
-from coopenv.cars.calibration.batch import LEAST_PLACE, LOSS, Kind, by_stretch, deviation, standard_errors
+from coopenv.cars.calibration.batch import LEAST_PLACE, LOSS, ParameterKind, by_stretch, deviation, standard_errors
 from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import Mask
 from coopenv.motions.command import follow_commands
@@ -31,19 +31,19 @@ REACHED = 4.5  # cost by which a limit is better than none: three standard devia
 SURE = 2.0  # cost by which a dead band is worse than the best: two standard deviations
 
 KINDS = (
-    Kind("fake.latency", "s", 0.2, 1e-4),
-    Kind("fake.speed_gain", "", 0.3, 1e-5),
-    Kind("fake.steering_gain", "", 0.3, 1e-5),
-    Kind("fake.steering_offset", "rad", 0.2, 1e-5),
-    Kind("fake.deceleration", "m/s^2", 3.0, 1e-4),
-    Kind("dynamics.max_acceleration", "m/s^2", 3.0, 1e-4),
-    Kind("dynamics.max_steering_rate", "rad/s", 5.0, 1e-4),
-    Kind("dynamics.max_speed", "m/s", 2.0, 1e-5),
-    Kind("dynamics.max_steering", "rad", 0.5, 1e-5),
-    Kind("dynamics.speed_time_constant", "s", 0.3, 1e-4),
-    Kind("dynamics.steering_time_constant", "s", 0.3, 1e-4),
-    Kind("fake.gyro_bias", "rad/s", 0.1, 1e-6),
-    Kind("fake.wheel_scale", "", 0.15, 1e-6),
+    ParameterKind("fake.latency", "s", 0.2, 1e-4),
+    ParameterKind("fake.speed_gain", "", 0.3, 1e-5),
+    ParameterKind("fake.steering_gain", "", 0.3, 1e-5),
+    ParameterKind("fake.steering_offset", "rad", 0.2, 1e-5),
+    ParameterKind("fake.deceleration", "m/s^2", 3.0, 1e-4),
+    ParameterKind("dynamics.max_acceleration", "m/s^2", 3.0, 1e-4),
+    ParameterKind("dynamics.max_steering_rate", "rad/s", 5.0, 1e-4),
+    ParameterKind("dynamics.max_speed", "m/s", 2.0, 1e-5),
+    ParameterKind("dynamics.max_steering", "rad", 0.5, 1e-5),
+    ParameterKind("dynamics.speed_time_constant", "s", 0.3, 1e-4),
+    ParameterKind("dynamics.steering_time_constant", "s", 0.3, 1e-4),
+    ParameterKind("fake.gyro_bias", "rad/s", 0.1, 1e-6),
+    ParameterKind("fake.wheel_scale", "", 0.15, 1e-6),
 )
 NAMES = [kind.name.split(".")[1] for kind in KINDS]
 LIMITS = slice(4, 9)

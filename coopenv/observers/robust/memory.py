@@ -190,7 +190,7 @@ class BearingMeasurement:
 
 
 @wp.struct
-class Reading:
+class FusedReading:
     """The rest of a measurement of a sensor beside the camera, two of its rows at most; scratch, see readings.py."""
 
     part: wp.int32  # which pair of its rows, from 0 on; -1: it is a bearing of the camera
@@ -295,7 +295,7 @@ def memory_struct(entries: str, of_reading: Any) -> Any:
     return RobustMemory
 
 
-RobustMemory, RobustMemoryWithReadings = memory_struct("X", Nothing), memory_struct("F", Reading)
+RobustMemory, RobustMemoryWithReadings = memory_struct("X", Nothing), memory_struct("F", FusedReading)
 
 
 ERRORS = 1  # the member that stands for the errors of odometry and of the focal length, see joint_state.py

@@ -31,7 +31,7 @@ from coopenv.observers.robust.measurements import (
 from coopenv.observers.robust.memory import (
     BearingFrame,
     Derivative,
-    Reading,
+    FusedReading,
     RobustMemory,
     RobustMemoryWithReadings,
     mat26d,
@@ -174,7 +174,7 @@ def add_readings_with_sensors(
             if state.reading_tick[world, i, sensor, entry] == frame.tick:
                 memory.reading_tick[world, i, sensor] = frame.tick
                 n = own.bearings
-                memory.reading[world, i, n] = Reading()
+                memory.reading[world, i, n] = FusedReading()
                 memory.reading[world, i, n].period = own.period
                 usable = bool(True)
                 if model.sensor[sensor].has_target == 1:
@@ -245,6 +245,8 @@ def linearise_reading_with_sensors(memory: RobustMemoryWithReadings, world: int,
     u = line / distance
     along, across = relative_spread(memory, world, i, member, wp.transpose(own.R) * theirs_R, u)
     frames = linearised_frames(member, memory.reading[world, i, n].period)
+    # ranges alone correct an error across them slowly, that of a landmark as well
+    radial_frames = frames_in(wp.float64(constants.CONSIDERED_LINEARISATION_TIME), memory.reading[world, i, n].period)
     arm = own.R * skew(memory.reading[world, i, n].place)
     reach = theirs_R * skew(point)
     H = mat26d()
@@ -263,8 +265,8 @@ def linearise_reading_with_sensors(memory: RobustMemoryWithReadings, world: int,
             if kind != RELATIVE_POSE:  # which is linear in the positions
                 radial = wp.dot(own.R * u, their_shift)
                 lateral = wp.length_sq(their_shift) - radial * radial
-                bent = lateral * along + wp.float64(0.5) * radial * radial * across
-                variance += frames * bent * across / (distance * distance)
+                bent = frames * lateral * along + wp.float64(0.5) * radial_frames * radial * radial * across
+                variance += bent * across / (distance * distance)
             std = wp.max(memory.reading[world, i, n].std[row], wp.float64(MIN_BEARING_STD))
             scale = wp.float64(1.0) / wp.sqrt(std * std + variance)
             own_turn = mounted * turn - wp.transpose(arm) * shift
