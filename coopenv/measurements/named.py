@@ -18,7 +18,7 @@ def name_in_logs(reference: str) -> str:
 
 
 def allow(reference: str) -> None:
-    """Let logs name a class, `file.py:Class` or `package.module:Class`; a scenario that names it does the same."""
+    """Let logs name a class, `file.py:Class` or `package.module:Class`, as that of a world which this program runs."""
     _references[name_in_logs(reference)] = reference
 
 
