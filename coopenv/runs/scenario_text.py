@@ -184,6 +184,7 @@ def sensor_row(section: SensorSection) -> tuple[str, ...]:
     made, correlated, outages = section.made, section.correlated, section.outages
     towards = made.towards if section.towards is None else section.towards
     stds = dict.fromkeys(f"{number(std)} {unit}" for std, unit in zip(section.white, made.units, strict=True))
+    unit = f" {made.units[0]}" if len({*made.units}) == 1 else ""
     return (
         section.label if section.label == section.kind else f"{section.label} ({section.kind})",
         ", ".join(section.vehicles or ["all vehicles"]),
@@ -195,8 +196,8 @@ def sensor_row(section: SensorSection) -> tuple[str, ...]:
         ),
         ", ".join(stds),
         lines(
-            section.bias and f"bias {number(section.bias)}",
-            correlated.std and f"{number(correlated.std)}, correlated over {number(correlated.time)} s",
+            section.bias and f"bias {number(section.bias)}{unit}",
+            correlated.std and f"{number(correlated.std)}{unit}, correlated over {number(correlated.time)} s",
             outages.rate and f"{number(60.0 * outages.rate)} outages a minute of {number(outages.duration)} s",
             section.miss_probability and f"{number(100.0 * section.miss_probability)} % missed",
             section.outliers.probability and f"{number(100.0 * section.outliers.probability)} % outliers",
@@ -213,8 +214,8 @@ def scene(scenario: Scenario, grouped: bool = True) -> Iterator[Table]:
     vehicles = ((name, start(v), estimate(v.initial_estimate), vehicle_motion(v), seen) for name, v, seen in pairs)
     columns = ("vehicle", "start", "initial estimate", "motion", "may measure")
     yield from _listing("Vehicles (m)", columns, vehicles)
-    columns = ("sensor", "on", "towards", "limits", "noise", "further errors")
-    yield from _listing("Sensors beside the camera", columns, map(sensor_row, scenario.sensors))
+    of_sensors = ("sensor", "on", "towards", "limits", "noise", "further errors")
+    yield from _listing("Sensors beside the camera", of_sensors, map(sensor_row, scenario.sensors))
     routes = (
         (
             *(r.name, ", ".join(map(vector, r.waypoints)), f"radius {number(r.corner_radius)}"),

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from coopenv.base import installation
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.sections import one_line
+from coopenv.measurements.named import allow
 from coopenv.motions.table import DRIVES
 from coopenv.scenario.cosimulators import COSIMULATORS, FILES
 from coopenv.scenario.terms import (
@@ -155,6 +156,9 @@ def located(
             result[section] = {**part, "custom": rows}
     if isinstance(sensors := result.get("sensors"), list):
         kinds = [_located(entry.get("kind"), folder, place) if isinstance(entry, dict) else None for entry in sensors]
+        for kind in kinds:
+            if isinstance(kind, str) and installation.is_reference(kind):
+                allow(kind)
         result["sensors"] = [
             {**entry, "kind": kind} if kind else entry for entry, kind in zip(sensors, kinds, strict=True)
         ]
