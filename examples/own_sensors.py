@@ -18,7 +18,7 @@ def away(own, point):
 
 
 class RangeDifference:
-    """How much farther a beacon is than a reference, m: arrival times of synchronised beacons."""
+    """Difference of the distances to a beacon and to a reference, m, by arrival times of their signals."""
 
     noise, units = 0.05, ("m",)
     towards = ("anchors",)

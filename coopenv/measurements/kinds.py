@@ -56,15 +56,20 @@ class Placed:
     def each(self) -> Iterator["Placed"]:
         """Yield the entries of a batch."""
         shape = self.position.shape[:-1]
-        parts = [np.broadcast_to(getattr(self, name), (*shape, *of)).reshape(-1, *of) for name, of in SHAPES.items()]
+        parts: list[Any] = [
+            np.broadcast_to(getattr(self, name), (*shape, *of)).reshape(-1, *of) for name, of in SHAPES.items()
+        ]
         moving = {
             name: np.broadcast_to(at, (*shape, 3)).reshape(-1, 3)
             for name, at in self.landmarks.items()
             if np.ndim(at) > 1
         }
-        for n, of_one in enumerate(zip(*parts, strict=True)):
-            now = Landmarks({**self.landmarks, **{name: at[n] for name, at in moving.items()}}) if moving else None
-            yield Placed(*of_one, self.landmarks if now is None else now)
+        for n in range(len(parts[0])):
+            marks = self.landmarks
+            if moving:
+                marks = Landmarks({**marks, **{name: at[n] for name, at in moving.items()}})
+            position, rotation, velocity, turning = (part[n] for part in parts)
+            yield Placed(position, rotation, velocity, turning, marks)
 
 
 class Landmarks(dict[str, Array]):
@@ -168,7 +173,7 @@ class Kind:
 
         def derivative(own: Placed, target: Placed) -> Array:
             change = self.residual(self.predict(own, target), np.broadcast_to(value, (count, *value.shape)))
-            return np.einsum("s,sa...->...a", weights, change.reshape(len(STEPS), 6, *change.shape[1:]))
+            return np.asarray(np.einsum("s,sa...->...a", weights, change.reshape(len(STEPS), 6, *change.shape[1:])))
 
         by_own = derivative(own.moved(errors), target.repeated(count))
         by_target = derivative(own.repeated(count), target.moved(errors)) if self.has_target else np.zeros_like(by_own)

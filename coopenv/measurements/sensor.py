@@ -15,6 +15,7 @@ from coopenv.base.errors import check_one_of
 from coopenv.base.installation import is_reference
 from coopenv.estimation.poses import Array, skew
 from coopenv.measurements.kinds import KINDS, Kind, Landmarks, Placed
+from coopenv.measurements.named import allow
 
 NOTHING = Landmarks()
 MAP = -1
@@ -32,6 +33,7 @@ def kind_of(reference: str, options: str = "{}") -> Kind:
     if is_reference(reference):
         from coopenv.measurements.own import OwnKind  # which most programs do not need
 
+        allow(reference)
         return OwnKind(reference, json.loads(options))
     return _shipped(reference)
 

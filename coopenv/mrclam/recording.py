@@ -116,7 +116,7 @@ def recording_of(dataset: Dataset, variant: Variant) -> Recording:
         readings["range"][k, i, column[seen], 0] = ranges
         arrays["bearings"][k, i, column[seen]], arrays["visible"][k, i, column[seen]] = vectors, True
         pose[:, i] = _truth(robot, held, t)
-        start[i], arrays["start_covariance"][i] = _start(robot, held, pose[:, i], t)
+        start[i], arrays["start_covariance"][i] = _start(robot, _reckoned(turn, path), pose[:, i], t)
     points = np.array([[*dataset.landmarks[subject], 0.0] for subject in sorted(dataset.landmarks)])
     arrays["landmarks"] = np.broadcast_to(points, (K, L, 3))
     arrays["start_rotation"], arrays["start_position"] = about_z(start[:, 2]), np.insert(start[:, :2], 2, 0.0, axis=1)
@@ -221,14 +221,21 @@ def _truth(robot: Robot, held: HeldCommands, t: Array) -> Array:
     return pose
 
 
-def _start(robot: Robot, held: HeldCommands, pose: Array, t: Array) -> tuple[Array, Array]:
+def _reckoned(turn: Array, path: Array) -> Array:
+    """Return x, y, heading (K, 3) at the ticks, seen from the pose at tick 0."""
+    heading = np.concatenate([[0.0], np.cumsum(turn)])
+    steps = np.concatenate([np.zeros((1, 2)), np.cumsum(arc(heading[:-1], path, turn), axis=0)])
+    return np.column_stack([steps, heading])
+
+
+def _start(robot: Robot, reckoned: Array, pose: Array, t: Array) -> tuple[Array, Array]:
     """Return the pose (3,) at tick 0 and its covariance (6, 6), LEFT coordinates."""
     known = np.flatnonzero(np.isfinite(pose).all(axis=1))
     if known.size == 0:
         raise DataError(f"robot {robot.subject}: no ground truth while it records odometry")
     first = known[:1]
     variances = np.square(START_STD) + np.square(DRIFT_STD) * t[first]
-    return _moved(pose[first], held.pose(t[first]), held.pose(t[:1]))[0], np.diag(np.repeat(variances, 3))
+    return _moved(pose[first], reckoned[first], reckoned[:1])[0], np.diag(np.repeat(variances, 3))
 
 
 def _moved(pose: Array, before: Array, after: Array) -> Array:

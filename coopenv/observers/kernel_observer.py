@@ -92,7 +92,8 @@ def _add_sensors(model: Any, setup: Setup, p: Precision) -> None:
         entry.kind = [*KINDS].index(sensor.reference) if sensor.reference in KINDS else -1
         entry.rows, entry.has_target, entry.ratio = kind.rows, int(kind.has_target), 1.0
         entry.rotation, entry.position = p.mat33(*sensor.rotation.ravel()), p.vec3(*sensor.position)
-        entry.counted = p.vec6(*np.pad(sensor.std, (0, MOST_ROWS - kind.rows)))
+        std = np.hypot(sensor.std, sensor.std_by_distance * USUAL_DISTANCE)
+        entry.counted = p.vec6(*np.pad(std, (0, MOST_ROWS - kind.rows)))
         measures[number, sensor.targets[sensor.targets != MAP]] = 1
         entries.append(entry)
     model.sensor = wp.array(entries, dtype=entry_struct(p, "sensor"), device="cpu")
@@ -106,6 +107,7 @@ def _add_sensors(model: Any, setup: Setup, p: Precision) -> None:
 
 PRECISION = "float64"
 UNITS_PER_TICK = 64
+USUAL_DISTANCE = 3.0  # m, at which noise that grows with the distance counts
 """The kernels' time is a whole number; here it counts 64ths of the first tick. So ticks may come at any time and
 messages be of any age, to 0.3 ms at 60 Hz; and, 64 being a power of two, regular ticks are as regular as in a world."""
 MOST_UNITS = 2**31 - 1

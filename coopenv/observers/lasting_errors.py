@@ -20,7 +20,7 @@ STATES = 11
 FORWARD, UP = 0, 2
 
 
-class Step(NamedTuple):
+class CalibratedStep(NamedTuple):
     """An odometry increment without its lasting errors, as far as they are known."""
 
     rotation: Array  # (3, 3)
@@ -50,7 +50,7 @@ class LastingErrors:
         """Forget the last sample."""
         self.before = np.zeros((2, 3))
 
-    def step(self, tick: Tick, values: Array) -> Step:
+    def step(self, tick: Tick, values: Array) -> CalibratedStep:
         """Return the increment of a tick, given values (c,) of the lasting errors."""
         turn, move = log_so3(tick.rotation), np.asarray(tick.translation, float)
         now = np.array([tick.angular_velocity, tick.velocity])
@@ -66,7 +66,7 @@ class LastingErrors:
         turn, move = turn + correction[:3], move + correction[3:]
         rotation = exp_so3(turn)
         by_errors = np.concatenate([right_jacobian(turn) @ J[:3], rotation.T @ J[3:]])
-        return Step(rotation, move, by_errors)
+        return CalibratedStep(rotation, move, by_errors)
 
     def on_bearings(
         self, linear: LinearMeasurements, tick: Tick, measured: UsableMeasurements, values: Array

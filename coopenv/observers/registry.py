@@ -191,7 +191,7 @@ def portable(name: str) -> str | Factory:
 
 def list_observers() -> list[str]:
     """Return every known name, without classes and import paths that were merely used."""
-    return sorted({*zoo(), *_listed & _registered.keys(), *offered(GROUP)})
+    return sorted({*zoo(), *_listed & _registered.keys(), *offered(GROUP)} - REPLACED.keys())
 
 
 def states_covariance(name: str) -> bool:

@@ -66,6 +66,8 @@ class SelfCalibrating(SchmidtKalman):
 
         look = look_with_neighbours(self.state, tick, measured, turns, places, by_constants)
         K, whole, N, dx, nis = halfway(joint, look, len(self.P))
-        R, p, self.P, *rest = considered_from(self.state.R, self.state.p, len(self.P), joint, K, whole, N, dx, nis)
-        self.values = self.values + dx[6 : len(self.P)]
-        return R, p, self.P[:6, :6], *rest
+        size = len(self.P)
+        made = considered_from(self.state.R, self.state.p, size, joint, K, whole, N, dx, nis)
+        R, p, self.P, carried, crosses, nis = made
+        self.values = self.values + dx[6:size]
+        return R, p, self.P[:6, :6], carried, crosses, nis

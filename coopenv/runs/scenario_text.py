@@ -214,8 +214,8 @@ def scene(scenario: Scenario, grouped: bool = True) -> Iterator[Table]:
     vehicles = ((name, start(v), estimate(v.initial_estimate), vehicle_motion(v), seen) for name, v, seen in pairs)
     columns = ("vehicle", "start", "initial estimate", "motion", "may measure")
     yield from _listing("Vehicles (m)", columns, vehicles)
-    columns = ("sensor", "on", "towards", "limits", "noise", "further errors")
-    yield from _listing("Sensors beside the camera", columns, map(sensor_row, scenario.sensors))
+    of_sensors = ("sensor", "on", "towards", "limits", "noise", "further errors")
+    yield from _listing("Sensors beside the camera", of_sensors, map(sensor_row, scenario.sensors))
     routes = (
         (
             *(r.name, ", ".join(map(vector, r.waypoints)), f"radius {number(r.corner_radius)}"),

@@ -8,7 +8,7 @@ setups, gains, noise, starts, scenario. `metadata_names` and `is_cut_off` look i
 import json
 import math
 import struct
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from functools import cache
@@ -22,10 +22,11 @@ from coopenv.base.errors import CoopenvError, DataError, regular
 from coopenv.base.format import jsonable
 from coopenv.base.installation import install_command, message_types, needing, version
 from coopenv.base.sections import Number, Section, Vector3
+from coopenv.measurements.named import name_in_logs, reference_of
 from coopenv.measurements.sensor import MAP, Sensor
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Drawn, Recording
-from coopenv.scenario import parse_scenario
+from coopenv.scenario import Scenario, parse_scenario
 from coopenv.scenario.own_terms import without_own_terms
 
 FORMAT = "coopenv recording 1"
@@ -152,7 +153,7 @@ class RecordingHeader(Section):
             "start_position": np.array(self.start_position),
             "start_covariance": np.array(self.start_covariance),
             "drawn": None if self.drawn is None else Drawn(**dict(self.drawn)),
-            "scenario": None if self.scenario is None else parse_scenario(without_own_terms(self.scenario), where),
+            "scenario": None if self.scenario is None else _scenario_of(self.scenario, where),
         }
 
 
@@ -162,9 +163,26 @@ def header_of(recording: Recording) -> bytes:
     for setup in values["setups"] if not recording.readings else ():
         for name in ONLY_WITH_SENSORS:
             del setup[name]
+    for setup in values["setups"] if recording.readings else ():
+        for sensor in setup["sensors"]:
+            sensor["reference"] = name_in_logs(sensor["reference"])
     if values["scenario"] is not None:
         values["scenario"] = without_own_terms(values["scenario"])
+        for sensor in values["scenario"].get("sensors", ()):
+            sensor["kind"] = name_in_logs(sensor["kind"])
     return json.dumps(values, separators=(",", ":")).encode()
+
+
+def _scenario_of(raw: Mapping[str, Any], where: str) -> Scenario:
+    """Return the scenario of a log; its sensors are of coopenv's kinds, or of classes that the user has named."""
+    values = without_own_terms(raw)
+    sensors = values.get("sensors")
+    if isinstance(sensors, list) and all(isinstance(sensor, Mapping) for sensor in sensors):
+        values["sensors"] = [
+            {**sensor, "kind": reference_of(str(sensor.get("kind")), str(sensor.get("name") or "*"))}
+            for sensor in sensors
+        ]
+    return parse_scenario(values, where)
 
 
 def _setup(header: Any) -> Setup:
@@ -182,6 +200,7 @@ def _setup(header: Any) -> Setup:
 
 def _sensor(header: Any) -> Sensor:
     arrays = {
+        "reference": reference_of(header.reference, header.name),
         "std": np.array(header.std, float),
         "targets": np.array(header.targets, np.int64),
         "position": np.array(header.position),

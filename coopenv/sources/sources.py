@@ -5,13 +5,16 @@ A wrong name is an error before any of the simulation is loaded.
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 from coopenv.base.errors import CoopenvError, DataError, check_one_of
+from coopenv.base.installation import absolute_reference
 from coopenv.base.plugins import call, offered
+from coopenv.measurements.named import allow
 from coopenv.sources.registry import ENVIRONMENT, GROUP, LOG, kind_of, kinds, live_kind
 from coopenv.sources.selection import WHOLE, Selection
 
@@ -78,6 +81,10 @@ def read_log(name: str | Path, data: str | Path | None, variant: str | None) -> 
     return read_recording(name)
 
 
+OWN_KIND = re.compile(r"sensors\.\w+\.kind")
+"""Override of a recording that names the class of one of its sensors."""
+
+
 def replay_of(
     name: str,
     overrides: Mapping[str, Any],
@@ -88,7 +95,10 @@ def replay_of(
     """Return the replay of a recording by its name; arguments and errors as for `open_recording`."""
     from coopenv.sources.worlds import Replay
 
-    return Replay(open_recording(name, data, variant, selection), Path(name).name, overrides)
+    rest = dict(overrides)
+    for key in [key for key in overrides if OWN_KIND.fullmatch(key)]:
+        allow(absolute_reference(str(rest.pop(key))))
+    return Replay(open_recording(name, data, variant, selection), Path(name).name, rest)
 
 
 def open_simulation(name_or_path: ScenarioLike, overrides: Mapping[str, Any] | None = None) -> Scenario:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from coopenv.measurements.kinds import KINDS, Kind, Placed
 from coopenv.measurements.sensor import MAP, Sensor, averaged_std, kind_of
 
-Array = np.ndarray
+Array = Any
 STEP = 1e-5  # rad and m, of central differences: their error is near 1e-10
 
 

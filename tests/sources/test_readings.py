@@ -15,6 +15,7 @@ from numpy.testing import assert_array_equal
 
 from coopenv import CoopenvError, DataError
 from coopenv.api.engine import Engine
+from coopenv.measurements import named
 from coopenv.measurements.kinds import KINDS
 from coopenv.measurements.sensor import MAP, Sensor
 from coopenv.observers import Recording, run
@@ -25,6 +26,7 @@ from coopenv.scenario import Scenario
 from coopenv.sources.base import Capabilities, TickGenerator, TickStream
 from coopenv.sources.mcap import read_recording, write_recording
 from coopenv.sources.selection import Selection
+from coopenv.sources.sources import open_backend
 from coopenv.sources.tick_world import TickWorld
 from coopenv.sources.worlds import Replay, Simulated, scenario_of
 from tests.helpers.builders import circling, scenario
@@ -94,6 +96,23 @@ def test_a_log_whose_sensor_class_is_gone_is_refused_in_one_line(tmp_path: Path)
     with pytest.raises(DataError, match=r"drive\.mcap.*mine\.py") as caught:
         read_recording(path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_log_runs_no_class_that_its_user_has_not_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mcap", reason="needs the extra 'log'")
+    from coopenv.sources.mcap_container import Container
+    from coopenv.sources.mcap_format import ATTACHMENT
+
+    own, path = tmp_path / "hers.py", tmp_path / "drive.mcap"
+    own.write_text("class Height:\n    noise, towards, has_target = 0.1, ('map',), False\n"
+                   "    def predict(self, own, target):\n        return own.position[2]\n")  # fmt: skip
+    write_recording(record(described(sensors=[{"kind": f"{own}:Height", "name": "height"}])), path)
+    assert str(tmp_path).encode() not in Container(path).extras()[1][ATTACHMENT]
+    monkeypatch.setattr(named, "_references", {})
+    with pytest.raises(DataError, match=r"drive\.mcap.*--set sensors\.height\.kind=hers\.py:Height"):
+        read_recording(path)
+    replay = open_backend(str(path), None, {"sensors.height.kind": f"{own}:Height"})
+    assert [section.label for section in replay.scenario.sensors] == ["height"]
 
 
 def test_the_state_of_a_replay_holds_the_readings_of_each_tick() -> None:

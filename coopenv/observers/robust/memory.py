@@ -201,6 +201,7 @@ class FusedReading:
     value: vec6d
     std: vec6d  # of the rows
     turn: mat33d  # orientation of the target, on the map or in the member's body
+    turn_known: wp.int32  # 0: that of a landmark that moves is not known
     turn_variance: wp.float64  # rad^2 per axis, of that
     period: wp.float64  # s, since the sensor's last measurements
 

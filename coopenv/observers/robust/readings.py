@@ -95,6 +95,7 @@ def turn_since_report(model: Any, memory: Any, world: int, i: int, n: int, frame
     memory.reading[world, i, n].turn = turn * exp_so3(memory.member[world, i, member].w * age)
     variance = odometry_noise(model, i, age)[0] * frames_in(age, frame.period) + away * away
     memory.reading[world, i, n].turn_variance = variance
+    memory.reading[world, i, n].turn_known = 1
 
 
 @device_function
@@ -108,8 +109,7 @@ def set_target(model: Any, state: Any, memory: Any, world: int, i: int, frame: B
         q = take_slot(memory, world, i, target, frame.tick, True, model.camera_period)
         memory.measurement[world, i, n].source = q
         memory.reading[world, i, n].turn = mat33d(state.rotation[world, target])
-        if model.motion.kind[target] != STATIC:  # not known
-            memory.reading[world, i, n].turn = wp.float64(wp.nan) * wp.identity(3, wp.float64)
+        memory.reading[world, i, n].turn_known = wp.where(model.motion.kind[target] == STATIC, 1, 0)
         return True
     member = index_of(memory, world, i, sender)
     if member == 0:
@@ -216,6 +216,29 @@ def unused_rows_with_sensors(memory: RobustMemoryWithReadings, world: int, i: in
 
 
 @device_function
+def bend_variances(member: int, period: Any, along: Any, across: Any):
+    """Return the variances of second-order errors, m^4, of rows across the line of sight and along it.
+
+    They are to be multiplied by the squared derivatives by the target's position and divided by the squared distance.
+    Ranges alone correct an error across them slowly, that of a landmark as well.
+    """
+    lasting = frames_in(wp.float64(constants.CONSIDERED_LINEARISATION_TIME), period)
+    return vec2d(linearised_frames(member, period) * along, wp.float64(0.5) * lasting * across) * across
+
+
+@device_function
+def row_scale(memory: Any, world: int, i: int, n: int, row: int, their_turn: Any, their_shift: Any, u: Any, bend: Any):
+    """Return the inverse of a row's standard deviation, by its derivatives by the target and `bend_variances`."""
+    std = wp.max(memory.reading[world, i, n].std[row], wp.float64(MIN_BEARING_STD))
+    radial = wp.dot(u, their_shift)
+    square = wp.length_sq(their_shift)
+    variance = std * std + bend[0] * (square - radial * radial) + bend[1] * radial * radial
+    variance += memory.measurement[world, i, n].variance * square
+    variance += memory.reading[world, i, n].turn_variance * wp.length_sq(their_turn)
+    return wp.float64(1.0) / wp.sqrt(variance)
+
+
+@device_function
 def linearise_reading(memory: RobustMemory, world: int, i: int, n: Any) -> bool:
     """Return whether its target is ahead."""
     return False
@@ -240,13 +263,14 @@ def linearise_reading_with_sensors(memory: RobustMemoryWithReadings, world: int,
     kind = memory.reading[world, i, n].kind
     value = memory.reading[world, i, n].value
     residual, predicted, by_own, by_target = rows_of_kind(kind, value, R, p, target_R, z)
-    line = wp.transpose(own.R) * (z - p)
+    line = z - p
     distance = wp.max(wp.length(line), wp.float64(1.0e-9))
     u = line / distance
-    along, across = relative_spread(memory, world, i, member, wp.transpose(own.R) * theirs_R, u)
-    frames = linearised_frames(member, memory.reading[world, i, n].period)
-    # ranges alone correct an error across them slowly, that of a landmark as well
-    radial_frames = frames_in(wp.float64(constants.CONSIDERED_LINEARISATION_TIME), memory.reading[world, i, n].period)
+    bend = vec2d()
+    if kind != RELATIVE_POSE:  # which is linear in the positions
+        to_own = wp.transpose(own.R)
+        along, across = relative_spread(memory, world, i, member, to_own * theirs_R, to_own * u)
+        bend = bend_variances(member, memory.reading[world, i, n].period, along, across) / (distance * distance)
     arm = own.R * skew(memory.reading[world, i, n].place)
     reach = theirs_R * skew(point)
     H = mat26d()
@@ -254,38 +278,26 @@ def linearise_reading_with_sensors(memory: RobustMemoryWithReadings, world: int,
     r = vec2d()
     used = int(0)
     for k in range(2):
-        row = 2 * memory.reading[world, i, n].part + k
-        if row < 6:
-            turn = vec3d(by_own[row, 0], by_own[row, 1], by_own[row, 2])
-            shift = vec3d(by_own[row, 3], by_own[row, 4], by_own[row, 5])
-            their_turn = vec3d(by_target[row, 0], by_target[row, 1], by_target[row, 2])
-            their_shift = vec3d(by_target[row, 3], by_target[row, 4], by_target[row, 5])
-            variance = memory.measurement[world, i, n].variance * wp.length_sq(their_shift)
-            variance += memory.reading[world, i, n].turn_variance * wp.length_sq(their_turn)
-            if kind != RELATIVE_POSE:  # which is linear in the positions
-                radial = wp.dot(own.R * u, their_shift)
-                lateral = wp.length_sq(their_shift) - radial * radial
-                bent = frames * lateral * along + wp.float64(0.5) * radial_frames * radial * radial * across
-                variance += bent * across / (distance * distance)
-            std = wp.max(memory.reading[world, i, n].std[row], wp.float64(MIN_BEARING_STD))
-            scale = wp.float64(1.0) / wp.sqrt(std * std + variance)
+        row = wp.min(2 * memory.reading[world, i, n].part + k, 5)
+        turn = vec3d(by_own[row, 0], by_own[row, 1], by_own[row, 2])
+        shift = vec3d(by_own[row, 3], by_own[row, 4], by_own[row, 5])
+        their_turn = vec3d(by_target[row, 0], by_target[row, 1], by_target[row, 2])
+        their_shift = vec3d(by_target[row, 3], by_target[row, 4], by_target[row, 5])
+        measured = wp.length_sq(turn) + wp.length_sq(shift) > wp.float64(0.0)
+        known = memory.reading[world, i, n].turn_known == 1 or wp.length_sq(their_turn) == wp.float64(0.0)
+        if measured and known:
+            scale = row_scale(memory, world, i, n, row, their_turn, their_shift, u, bend)
             own_turn = mounted * turn - wp.transpose(arm) * shift
             own_shift = wp.transpose(own.R) * shift
-            member_turn = vec3d()
-            member_shift = vec3d()
-            if member > 0:
-                member_turn = memory.reading[world, i, n].turn * their_turn - wp.transpose(reach) * their_shift
-                member_shift = wp.transpose(theirs_R) * their_shift
-            total = residual[row] + wp.length_sq(own_turn) + wp.length_sq(member_turn)
-            if wp.isfinite(total + wp.length_sq(own_shift) + wp.length_sq(member_shift)):
-                r[k] = scale * residual[row]
-                for j in range(3):
-                    H[k, j] = scale * own_turn[j]
-                    H[k, j + 3] = scale * own_shift[j]
-                    G[k, j] = scale * member_turn[j]
-                    G[k, j + 3] = scale * member_shift[j]
-                if wp.length_sq(turn) + wp.length_sq(shift) > wp.float64(0.0):
-                    used += 1
+            member_turn = memory.reading[world, i, n].turn * their_turn - wp.transpose(reach) * their_shift
+            member_shift = wp.transpose(theirs_R) * their_shift
+            r[k] = scale * residual[row]
+            for j in range(3):
+                H[k, j] = scale * own_turn[j]
+                H[k, j + 3] = scale * own_shift[j]
+                G[k, j] = scale * member_turn[j]
+                G[k, j + 3] = scale * member_shift[j]
+            used += 1
     memory.reading[world, i, n].used = used
     memory.derivative[world, i, n, 0] = Derivative(0, H)
     memory.derivative[world, i, n, 1] = Derivative(wp.where(member > 0, member, -1), G)

@@ -50,7 +50,7 @@ SENDER = len(LANDMARKS) + 1
 def sensor_of(kind: str, targets: Sequence[int]) -> Sensor:
     """Return a sensor that is turned in its body and off its origin, with another noise in each row."""
     made = kind_of(kind)
-    std = STD.get(kind, 0.01) * (1.0 + 0.3 * np.arange(made.rows))
+    std = np.array(STD.get(kind, 0.01) * (1.0 + 0.3 * np.arange(made.rows)), np.float64)
     given = np.array(targets if made.has_target else [MAP], np.int64)
     return Sensor(kind, kind, std, given, MOUNTED[1], MOUNTED[0])
 
