@@ -102,7 +102,7 @@ class KeepContact(RouteFollower):
     """
 
     needs = ("message_position",)
-    slowest = 0.25  # of the top speed, so that a car behind that never moves again does not hold it for ever
+    slowest = 0.5  # of the top speed, so that a car behind that never moves again does not hold it for ever
 
     def __init__(self, scenario: Scenario) -> None:
         """See `Driver`."""
