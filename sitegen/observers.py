@@ -14,7 +14,7 @@ TABLE = "docs/observers.md"
 MORE = {
     "riccati": "../../method.md",
     "robust": "../../robust.md",
-    "self_calibrating": "../../data.md",
+    "planar_robust": "../../planar_robust.md",
 }
 """Where the documents explain an observer."""
 HEAD = """# Observers

@@ -22,7 +22,7 @@ HEADER = (
 
 def pose(robot: int, t: np.ndarray) -> np.ndarray:
     """Return (N, 3) x, y, heading of a robot on its circle, exactly as v and omega say."""
-    v, omega = motion(robot)
+    v, omega = command(robot)
     heading = 0.6 * robot + omega * t
     radius = v / omega
     x = 0.8 * np.cos(robot) + radius * (np.sin(heading) - np.sin(0.6 * robot))
@@ -30,20 +30,20 @@ def pose(robot: int, t: np.ndarray) -> np.ndarray:
     return np.stack([x, y, (heading + np.pi) % (2 * np.pi) - np.pi], axis=-1)
 
 
-def motion(robot: int) -> tuple[float, float]:
+def command(robot: int) -> tuple[float, float]:
     """Return v m/s and omega rad/s."""
     return 0.1 + 0.01 * robot, 0.1 * (-1) ** robot
 
 
-def command(robot: int) -> tuple[float, float]:
+def calibrated_command(robot: int) -> tuple[float, float]:
     """Return the commanded v and omega that the nominal calibration turns into the motion."""
-    v, omega = motion(robot)
+    v, omega = command(robot)
     commanded = omega / 0.93 + 0.006
     return v / 1.04 / (1.0 - 0.5 * abs(commanded)), commanded
 
 
-def write(parent: Path, number: int = 6, seconds: float = 40.0) -> Path:
-    """Write a sub-dataset without noise and return its folder."""
+def write(parent: Path, number: int = 6, seconds: float = 40.0, calibrated: bool = False) -> Path:
+    """Write a sub-dataset without noise and return its folder; `calibrated`: by commands of the nominal calibration."""
     folder = parent / f"MRCLAM_Dataset{number}"
     folder.mkdir()
     put(folder / "Barcodes.dat", [f"{s:3d} \t {b:4d}" for s, b in BARCODES.items()])
@@ -54,7 +54,7 @@ def write(parent: Path, number: int = 6, seconds: float = 40.0) -> Path:
         stamped = np.column_stack([ORIGIN + t, pose(robot, t)])
         rows = [f"{a:.3f} \t {x:.8f} \t {y:.8f} \t {h:.8f}" for a, x, y, h in stamped]
         put(folder / f"Robot{robot}_Groundtruth.dat", rows)
-        v, omega = command(robot)
+        v, omega = calibrated_command(robot) if calibrated else command(robot)
         t = np.arange(0.1, seconds - 0.5, 0.02)
         put(folder / f"Robot{robot}_Odometry.dat", [f"{ORIGIN + a:.3f} \t {v:.8f} \t {omega:.8f}" for a in t])
         put(folder / f"Robot{robot}_Measurement.dat", _sightings(robot, seconds))

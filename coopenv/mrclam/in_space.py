@@ -1,0 +1,186 @@
+"""A sub-dataset of MR.CLAM as a `Recording` of vehicles in space, with ranges, a level floor and calibrated odometry.
+
+Five robots on a level floor (z = 0) among 15 landmarks. Ticks are 0.05 s apart; tick 0 is the first odometry sample
+of any robot. A camera frame counts at the next tick; its bearings are turned by the odometry's rotation in between.
+All robots receive from all others: at tick k the last message of tick k - 1 or before.
+
+The camera's bearings are those of the recording; the ranges that it derives from the size of a barcode are readings of
+a sensor `range`. All measurements lie in the plane, so that by symmetry an estimate on the plane stays there. Two more
+sensors bound the variances of what the robots cannot do: `level` measures roll and pitch, `height` measures z.
+
+Odometry is the commands, which a nominal calibration turns into motion. `SensorNoise` declares what the calibration of
+one robot may differ by, so that a filter can estimate it (`coopenv.observers.lasting_errors`).
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coopenv.base.errors import DataError
+from coopenv.estimation.poses import Array, about_z
+from coopenv.measurements.sensor import MAP, Sensor
+from coopenv.mrclam.dataset import ROBOTS, Dataset, HeldCommands, Robot, arc
+from coopenv.mrclam.recording import (
+    DRIFT_STD,
+    GAINS,
+    MESSAGE_PERIOD_TICKS,
+    START_STD,
+    TICK_S,
+    Variant,
+    _moved,
+    _seen,
+    _truth,
+    check_variant,
+)
+from coopenv.observers.contract import Gains, SensorNoise, Setup
+from coopenv.observers.recording import Recording, check_recording, received_by_all
+from coopenv.observers.sensed import Truth
+
+# The next constants were tuned on sub-dataset 6 (docs/data.md).
+LEAD_S = 0.2  # by which commands are ahead of the motion
+TURN_SCALE, SPEED_SCALE = 0.93, 1.04  # motion over command
+STRAIGHT_RATE = 0.006  # rad/s, the commanded rate at which a robot drives straight
+TURNING_LOSS = 0.5  # s/rad, share of the speed that a robot loses per rate of turn
+NOISE = SensorNoise(
+    velocity=0.002 / math.sqrt(TICK_S),
+    angular_velocity=0.008 / math.sqrt(TICK_S),
+    odometry_period=TICK_S,
+    bearing=0.025,
+    odometry_scale=0.05,
+    camera_orientation=0.02,
+    turn_scale=0.25,
+    curvature=0.05,
+    turning_loss=0.6,
+    odometry_lead=0.1,
+    velocity_by_speed=0.12 / math.sqrt(TICK_S),
+    angular_velocity_by=(0.1 / math.sqrt(TICK_S), 0.2 / math.sqrt(TICK_S)),
+)
+"""Noise of all sub-datasets."""
+RANGE_STD, RANGE_STD_BY_DISTANCE = 0.1, 0.15
+"""m, and m per m. The errors of ranges have a standard deviation of 0.044 m per m, and those of two ranges to the same
+landmark within a second have a correlation of 0.95, by which they average as white noise of up to 0.27 m per m."""
+FLOOR_STD = 0.01  # rad and m, of the level floor
+UNKNOWN_STD = 1e3  # rad and m, of what the floor does not tell: heading, x and y
+FLOOR_PERIOD_TICKS = 40
+
+
+def spatial_recording_of(dataset: Dataset, variant: Variant) -> Recording:
+    """Put a sub-dataset on ticks.
+
+    Truth is NaN where motion capture is not valid. Every robot starts at its true pose; one that motion capture sees
+    later starts at the pose of backward dead reckoning from there. In the variant `landmarks` no robot sees another, in
+    `landmarks+robots` everything counts, and in `blind` robots 3 to 5 see robots only.
+
+    Raises:
+        DataError: unknown variant, motion capture never sees a robot, or its data make no sense.
+    """
+    check_variant(variant)
+    subjects = [*sorted(dataset.landmarks), *ROBOTS]
+    L, N = len(dataset.landmarks), len(ROBOTS)
+    T = L + N
+    t = np.arange(int(dataset.duration_s / TICK_S) + 1, dtype=np.float64) * TICK_S
+    K = len(t)
+    column = np.zeros(max(subjects) + 1, dtype=np.int64)
+    column[subjects] = np.arange(T)
+    arrays: dict[str, Any] = {
+        "rotation": np.broadcast_to(np.eye(3), (K, N, 3, 3)).copy(),
+        **{name: np.zeros((K, N, 3)) for name in ("translation", "velocity", "angular_velocity")},
+        "bearings": np.full((K, N, T, 3), np.nan),
+        "visible": np.zeros((K, N, T), bool),
+        "start_covariance": np.zeros((N, 6, 6)),
+    }
+    readings = {
+        "range": np.full((K, N, T, 1), np.nan),
+        "level": np.full((K, N, 1, 3), np.nan),
+        "height": np.full((K, N, 1, 3), np.nan),
+    }
+    for name in ("level", "height"):
+        readings[name][1::FLOOR_PERIOD_TICKS] = 0.0
+    pose, start = np.zeros((K, N, 3)), np.zeros((N, 3))
+    for i, robot in enumerate(dataset.robots):
+        held = HeldCommands(robot)
+        turn, path = _motion(held, t)
+        arrays["velocity"][1:, i, 0], arrays["angular_velocity"][1:, i, 2] = path / TICK_S, turn / TICK_S
+        arrays["translation"][1:, i, :2] = arc(np.zeros_like(turn), path, turn)
+        arrays["rotation"][1:, i] = about_z(turn)
+        k, seen, vectors, ranges = _seen(robot, variant, held, t)
+        readings["range"][k, i, column[seen], 0] = ranges
+        arrays["bearings"][k, i, column[seen]], arrays["visible"][k, i, column[seen]] = vectors, True
+        pose[:, i] = _truth(robot, held, t)
+        start[i], arrays["start_covariance"][i] = _start(robot, _reckoned(turn, path), pose[:, i], t)
+    points = np.array([[*dataset.landmarks[subject], 0.0] for subject in sorted(dataset.landmarks)])
+    arrays["landmarks"] = np.broadcast_to(points, (K, L, 3))
+    arrays["start_rotation"], arrays["start_position"] = about_z(start[:, 2]), np.insert(start[:, :2], 2, 0.0, axis=1)
+    recording = Recording(
+        setups=_setups(sorted(dataset.landmarks)),
+        order=tuple(range(N)),
+        dt=TICK_S,
+        inbox_tick=received_by_all(K, N, MESSAGE_PERIOD_TICKS),
+        period=MESSAGE_PERIOD_TICKS,
+        staleness=math.inf,
+        due=np.ones(K, bool),
+        truth=Truth(about_z(pose[..., 2]), np.concatenate([pose[..., :2], 0.0 * pose[..., :1]], axis=-1)),
+        readings=readings,
+        **arrays,
+    )
+    check_recording(recording, dataset.name)
+    return recording
+
+
+def _setups(subjects: list[int]) -> tuple[Setup, ...]:
+    known = [f"landmark_{s}" for s in subjects]
+    names, landmarks = (*known, *(f"vehicle_{s}" for s in ROBOTS)), len(known)
+    k, q, V, P0, max_turn = GAINS
+    gains = Gains(k, np.full(len(names), q), V, P0, max_turn)
+    return tuple(
+        Setup(
+            vehicle=i,
+            name=f"vehicle_{robot}",
+            target_names=names,
+            landmarks=landmarks,
+            targets=np.delete(np.arange(len(names)), landmarks + i),
+            lever_arm=np.zeros(3),
+            marker=np.zeros(3),
+            noise=NOISE,
+            gains=gains,
+            sensors=_sensors(np.delete(np.arange(len(names)), landmarks + i)),
+        )
+        for i, robot in enumerate(ROBOTS)
+    )
+
+
+def _sensors(targets: NDArray[np.int64]) -> tuple[Sensor, ...]:
+    """Return the sensors of a robot beside its camera, in the body's origin."""
+    place = np.zeros(3), np.eye(3)
+    floor, the_map = np.full(3, FLOOR_STD), np.array([MAP])
+    return (
+        Sensor("range", "range", np.array([RANGE_STD]), targets, *place, std_by_distance=RANGE_STD_BY_DISTANCE),
+        Sensor("level", "attitude", np.where([False, False, True], UNKNOWN_STD, floor), the_map, *place),
+        Sensor("height", "position", np.where([True, True, False], UNKNOWN_STD, floor), the_map, *place),
+    )
+
+
+def _motion(held: HeldCommands, t: Array) -> tuple[Array, Array]:
+    """Return the turns (K - 1,) rad and paths (K - 1,) m between ticks, by the nominal calibration of commands."""
+    turn, path = np.diff(held.sums(t - LEAD_S), axis=0).T
+    straight = np.where(path == 0.0, 0.0, STRAIGHT_RATE * TICK_S)
+    return TURN_SCALE * (turn - straight), SPEED_SCALE * path * (1.0 - TURNING_LOSS * np.abs(turn) / TICK_S)
+
+
+def _reckoned(turn: Array, path: Array) -> Array:
+    """Return x, y, heading (K, 3) at the ticks, seen from the pose at tick 0."""
+    heading = np.concatenate([[0.0], np.cumsum(turn)])
+    steps = np.concatenate([np.zeros((1, 2)), np.cumsum(arc(heading[:-1], path, turn), axis=0)])
+    return np.column_stack([steps, heading])
+
+
+def _start(robot: Robot, reckoned: Array, pose: Array, t: Array) -> tuple[Array, Array]:
+    """Return the pose (3,) at tick 0 and its covariance (6, 6), LEFT coordinates."""
+    known = np.flatnonzero(np.isfinite(pose).all(axis=1))
+    if known.size == 0:
+        raise DataError(f"robot {robot.subject}: no ground truth while it records odometry")
+    first = known[:1]
+    variances = np.square(START_STD) + np.square(DRIFT_STD) * t[first]
+    return _moved(pose[first], reckoned[first], reckoned[:1])[0], np.diag(np.repeat(variances, 3))
