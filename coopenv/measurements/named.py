@@ -1,6 +1,6 @@
 """Users' classes of sensors that a program may run: those that its user has named, and no others.
 
-A log holds the name of a class alone, without a folder. Code that somebody else's log names does not run.
+A log holds the name of a class alone, without a folder. No code runs only because a log names it.
 """
 
 from pathlib import Path

@@ -62,7 +62,7 @@ RANGE_STD, RANGE_STD_BY_DISTANCE = 0.1, 0.15
 """m, and m per m. The errors of ranges have a standard deviation of 0.044 m per m, and those of two ranges to the same
 landmark within a second have a correlation of 0.95, by which they average as white noise of up to 0.27 m per m."""
 FLOOR_STD = 0.01  # rad and m, of the level floor
-UNKNOWN_STD = 1e3  # rad and m, of what the floor does not tell: heading, x and y
+UNKNOWN_STD = 1e3  # rad and m, of what the floor does not show: heading, x and y
 FLOOR_PERIOD_TICKS = 40
 
 

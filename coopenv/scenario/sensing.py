@@ -69,9 +69,8 @@ class Camera(Section):
     """The camera that every vehicle carries, unless it has its own; optical frame: x right, y down, z forward."""
 
     model: Annotated[Literal["pinhole", "omnidirectional", "none"], BeforeValidator(_known_model)] = "omnidirectional"
-    """`omnidirectional` sees in every direction; `pinhole` is bounded by its image; `none`: no camera. Model, range,
-    distortion and quantisation matter only where `topology.mode` is `sensed`; with `fixed` every neighbour is always
-    measured."""
+    """`omnidirectional` sees in every direction; `pinhole` is bounded by its image. The model, range, distortion
+    and quantisation matter only where `topology.mode` is `sensed`; with `fixed` every neighbour is always measured."""
     position: Annotated[Vector3, units.LENGTH] = (0.0, 0.0, 0.0)
     """Optical centre in the body frame, m."""
     orientation: Literal["forward", "body"] | QuaternionWxyz = "forward"

@@ -73,9 +73,9 @@ def test_the_site_has_every_table_of_the_reference() -> None:
 def test_the_page_on_observations_explains_every_entry() -> None:
     page = reference.observation()
     assert (
-        "| targets | number of targets | 0 | vehicle |" in page and "| rad | angle at action 1 | 0 | vehicle |" in page
+        "| targets | number of targets | 0 | vehicle |" in page and "| rad | value at action 1 | 0 | vehicle |" in page
     )
-    assert not re.search(r"\| (targets|steering|pan) \| 0 \| vehicle \|", page)
+    assert not re.search(r"\| (targets|steering|turn_rate|pan) \| 0 \| vehicle \|", page)
     assert all(
         f"| `{name}` | {field.meaning} | {field.unit} |" in page for name, field in OBSERVATION_FIELDS.built_in.items()
     )
@@ -143,6 +143,7 @@ PAGES = {
     "how-to/faults.md": [pytest.mark.slow],
     "how-to/batches.md": [],
     "contributing/sensor.md": [pytest.mark.slow],
+    "contributing/vehicle.md": [pytest.mark.slow],
 }
 
 
