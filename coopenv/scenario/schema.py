@@ -40,6 +40,9 @@ FAR_FROM_ORIGIN = 50.0
 """m; beyond it the paper's observer loses accuracy, because it is not invariant to the map origin."""
 
 
+BEARINGS_ALONE = ("riccati", "hamel_samson", "p3p", "factor_graph")
+"""Observers that take no measurements of sensors beside the camera."""
+
 READ = "coopenv.load_scenario reads one by name, from a file or from a dict"
 
 
@@ -495,6 +498,9 @@ def _doubts(s: Scenario, neighbours: Sequence[Sequence[int]]) -> Iterator[str]:
     elif bearings_alone and lonely:
         verb = "has" if len(lonely) == 1 else "have"
         yield f"{listed(lonely)} {verb} fewer than three neighbours: observability is not guaranteed"
+    if s.sensors and s.observer.name in BEARINGS_ALONE:
+        ignored = listed([sensor.label for sensor in s.sensors])
+        yield f"observer '{s.observer.name}' takes the camera's bearings alone and ignores {ignored}"
     for landmark in s.landmarks if s.observer.name == "riccati" else ():
         distance = float(np.linalg.norm(np.array(landmark.position) - np.array(s.map.origin)))
         if distance > FAR_FROM_ORIGIN:
