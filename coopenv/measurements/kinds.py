@@ -180,17 +180,6 @@ class Kind:
         return by_own, by_target
 
 
-KINDS: dict[str, str] = {
-    "bearing": "bearing:Bearing",
-    "range": "range:Range",
-    "range_bearing": "range_bearing:RangeBearing",
-    "position": "position:Position",
-    "attitude": "attitude:Attitude",
-    "relative_pose": "relative_pose:RelativePose",
-}
-"""Shipped kinds by name: module of this package and class."""
-
-
 def unit(v: Array) -> tuple[Array, Array]:
     """Return the unit vectors (..., 3) along v and the lengths (..., 1)."""
     length = np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-9)

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from coopenv.base.errors import check_one_of
 from coopenv.base.installation import is_reference
 from coopenv.estimation.poses import Array, skew
-from coopenv.measurements.kinds import KINDS, Kind, Landmarks, Placed
+from coopenv.measurements.kinds import Kind, Landmarks, Placed
 from coopenv.measurements.named import allow
+from coopenv.measurements.table import KINDS
 
 NOTHING = Landmarks()
 MAP = -1

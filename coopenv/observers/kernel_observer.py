@@ -16,8 +16,9 @@ import warp as wp
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array, Coordinates, left_covariance
-from coopenv.measurements.kinds import KINDS, MOST_ROWS
+from coopenv.measurements.kinds import MOST_ROWS
 from coopenv.measurements.sensor import MAP
+from coopenv.measurements.table import KINDS
 from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick, check_message
 from coopenv.world.embedded import Embedded, Messages
 from coopenv.world.launch import Launcher, start_warp

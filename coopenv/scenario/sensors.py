@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -12,10 +12,12 @@ from coopenv.base import units
 from coopenv.base.errors import CoopenvError, check_one_of, shown
 from coopenv.base.installation import check_reference, is_reference
 from coopenv.base.sections import NonNegative, Positive, QuaternionWxyz, Rate, Section, Vector3
-from coopenv.estimation.poses import Array
-from coopenv.measurements.kinds import KINDS, Kind
-from coopenv.measurements.sensor import averaged_std, kept_kind
+from coopenv.measurements.table import KINDS
 from coopenv.scenario.sensing import rotation_of
+
+if TYPE_CHECKING:
+    from coopenv.estimation.poses import Array
+    from coopenv.measurements.kinds import Kind
 
 GROUPS = ("landmarks", "vehicles", "anchors", "map")
 """Targets of a sensor, beside single landmarks and vehicles by name."""
@@ -90,12 +92,14 @@ class SensorSection(Section):
         return json.dumps(self.options, sort_keys=True)
 
     @property
-    def made(self) -> Kind:
+    def made(self) -> "Kind":
         """Its kind. Raises CoopenvError: it cannot be used."""
+        from coopenv.measurements.sensor import kept_kind  # which reading a scenario does not need
+
         return kept_kind(self.kind, self.arguments)
 
     @property
-    def white(self) -> Array:
+    def white(self) -> "Array":
         """(rows,) standard deviations of white noise. Raises CoopenvError: there are not as many as rows."""
         rows = self.made.rows
         given = np.atleast_1d(np.array(self.made.noise if self.noise is None else self.noise, float))
@@ -103,13 +107,15 @@ class SensorSection(Section):
             raise CoopenvError(f"sensors.{self.label}.noise: {len(given)} numbers for {rows} rows")
         return np.broadcast_to(given, rows)
 
-    def counted(self, camera: float) -> Array:
+    def counted(self, camera: float) -> "Array":
         """Return standard deviations (rows,) by which filters count its noise; `camera` is the rate of ticks, Hz."""
         period = 1.0 / min(self.rate or math.inf, camera)
+        from coopenv.measurements.sensor import averaged_std
+
         return averaged_std(self.white, self.correlated.std, self.correlated.time, period)
 
     @property
-    def mounting(self) -> Array:
+    def mounting(self) -> "Array":
         """(3, 3) sensor to body."""
         return np.asarray(rotation_of(None, None if self.orientation == "body" else self.orientation))
 

@@ -15,7 +15,8 @@ import warp as wp
 from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array
 from coopenv.measurements.bearing import Bearing
-from coopenv.measurements.kinds import KINDS, MOST_ROWS, WarpFunctions
+from coopenv.measurements.kinds import MOST_ROWS, WarpFunctions
+from coopenv.measurements.table import KINDS
 from coopenv.scenario import Scenario
 from coopenv.scenario.sensors import SensorSection
 from coopenv.world.camera import behind_building, inverse_square_of, marker_position, occlusion

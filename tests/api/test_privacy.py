@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.evaluation.episodes import driven_vehicles
-from coopenv.measurements.kinds import KINDS
 from coopenv.measurements.sensor import kind_of
+from coopenv.measurements.table import KINDS
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.schema import neighbour_sets
 from coopenv.scenario.terms import GROUPS

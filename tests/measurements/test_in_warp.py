@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from coopenv.measurements.kinds import KINDS, Kind, Placed, exponential
+from coopenv.measurements.kinds import Kind, Placed, exponential
 from coopenv.measurements.sensor import kind_of
+from coopenv.measurements.table import KINDS
 from tests.helpers.warp_calls import DTYPES, Calls
 
 SHIPPED: dict[str, Kind] = {name: kind_of(name) for name in KINDS}

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.measurements.kinds import KINDS, Kind, Placed
+from coopenv.measurements.kinds import Kind, Placed
 from coopenv.measurements.sensor import MAP, Sensor, averaged_std, kind_of
+from coopenv.measurements.table import KINDS
 
 Array = Any
 STEP = 1e-5  # rad and m, of central differences: their error is near 1e-10

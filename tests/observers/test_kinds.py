@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from coopenv.estimation.poses import Array, Coordinates, exp_so3
-from coopenv.measurements.kinds import KINDS, Placed
+from coopenv.measurements.kinds import Placed
 from coopenv.measurements.sensor import MAP
+from coopenv.measurements.table import KINDS
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Tick

@@ -16,8 +16,8 @@ from numpy.testing import assert_array_equal
 from coopenv import CoopenvError, DataError
 from coopenv.api.engine import Engine
 from coopenv.measurements import named
-from coopenv.measurements.kinds import KINDS
 from coopenv.measurements.sensor import MAP, Sensor
+from coopenv.measurements.table import KINDS
 from coopenv.observers import Recording, run
 from coopenv.observers.contract import SensorNoise
 from coopenv.observers.sensed import Sensed

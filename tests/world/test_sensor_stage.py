@@ -12,8 +12,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import CoopenvError, ScenarioError
-from coopenv.measurements.kinds import KINDS, Kind, Placed
+from coopenv.measurements.kinds import Kind, Placed
 from coopenv.measurements.sensor import kept_kind
+from coopenv.measurements.table import KINDS
 from coopenv.scenario import Scenario
 from coopenv.sources.worlds import Simulated, SimulatedWorld
 from tests.helpers.builders import constant, landmark, run, same_bits, scenario, start, vehicle

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coopenv.api.terms.readings import reading_fields
 from coopenv.base.errors import CoopenvError, check_one_of, listed
 from coopenv.motions.table import MOTIONS, columns_of
 from coopenv.scenario import Scenario
@@ -99,7 +98,11 @@ def included_fields(scenario: Scenario) -> dict[str, ObservationField]:
         CoopenvError: one is not known in this process, or none is left.
     """
     wanted, unwanted = scenario.observation.include, scenario.observation.exclude
-    known = {**OBSERVATION_FIELDS.known(scenario.observation.custom), **reading_fields(scenario)}
+    known = OBSERVATION_FIELDS.known(scenario.observation.custom)
+    if scenario.sensors:
+        from coopenv.api.terms.readings import reading_fields  # with Warp, which few descriptions need
+
+        known = {**known, **reading_fields(scenario)}
     by_group: dict[str, dict[str, ObservationField]] = {READINGS: {}}
     for name, row in known.items():
         by_group.setdefault(row.group or name, {})[name] = row

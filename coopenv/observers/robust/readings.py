@@ -13,8 +13,8 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import exp_so3, skew
-from coopenv.measurements.kinds import KINDS
 from coopenv.measurements.sensor import kind_of
+from coopenv.measurements.table import KINDS
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import between, odometry_noise

@@ -12,7 +12,7 @@ import coopenv
 from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import CoopenvError
-from coopenv.measurements.kinds import KINDS
+from coopenv.measurements.table import KINDS
 from coopenv.scenario import Scenario
 from tests.helpers.builders import circling, scenario
 

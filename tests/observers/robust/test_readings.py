@@ -14,8 +14,9 @@ from scipy.optimize import approx_fprime, least_squares
 
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import about_z
-from coopenv.measurements.kinds import KINDS, Placed
+from coopenv.measurements.kinds import Placed
 from coopenv.measurements.sensor import MAP, Reading, Sensor, kind_of
+from coopenv.measurements.table import KINDS
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.robust.observer import ROBUST, WITH_READINGS
 from coopenv.runs.recorder import record
