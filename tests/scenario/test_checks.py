@@ -165,7 +165,13 @@ def test_a_sound_scenario_does_not_warn(origin: float) -> None:
 def test_the_number_of_landmarks_is_not_doubted_with_sensors_beside_the_camera() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        parse_scenario(builders.raw([vehicle()], landmarks=[], sensors=[{"kind": "position"}]), "here")
+        raw = builders.raw([vehicle()], landmarks=[], sensors=[{"kind": "position"}], observer={"name": "robust"})
+        parse_scenario(raw, "here")
+
+
+def test_sensors_that_an_observer_ignores_are_named() -> None:
+    with pytest.warns(ScenarioWarning, match="observer 'riccati' takes the camera's bearings alone and ignores uwb"):
+        parse_scenario(builders.raw([vehicle()], sensors=[{"kind": "range", "name": "uwb"}]), "here")
 
 
 def shifted(origin: tuple[float, float, float], **sections: Any) -> dict[str, Any]:
