@@ -96,7 +96,7 @@ def test_list_as_json(line: str, names: Callable[[], list[str]], capsys: pytest.
 def test_a_description_fits_one_screen(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["describe", name]) == 0
     out = capsys.readouterr().out
-    assert len(out.splitlines()) <= (26 if coopenv.load_scenario(name).sensors else 24)
+    assert len(out.splitlines()) <= 24
     assert max(len(line.rstrip()) for line in out.splitlines()) <= 80
     env = coopenv.parallel_env(name)
     size = env.observation_space(env.possible_agents[0]).shape[0]

@@ -154,7 +154,7 @@ def test_a_city_is_checked_in_few_calls() -> None:
         coopenv.load_scenario("city")
     finally:
         sys.setprofile(None)
-    assert calls < 132_000
+    assert calls < 130_000
 
 
 def test_make_finds_environments_after_the_import_alone() -> None:

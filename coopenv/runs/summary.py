@@ -68,7 +68,7 @@ def facts(scenario: Scenario) -> dict[str, str]:
         + ", ".join(f"{group} {size}" for group, size in groups.items() if size),
     }
     if scenario.sensors:
-        found["Sensors"] = "; ".join(_sensor(scenario, section) for section in scenario.sensors)
+        found["Sensors"] = "; ".join(_sensor(section) for section in scenario.sensors)
     if scenario.driven:
         spans = [f"{entry.name} {number(entry.low)} to {number(entry.high)} {entry.unit}" for entry in layout.action]
         found["Action"] = f"{len(spans)} numbers in [-1, 1]: {', '.join(spans)}{_own(scenario, 'dynamics')}"
@@ -149,19 +149,11 @@ def _camera(scenario: Scenario) -> str:
     return f"{seen}; bearings, {spread}" + (f"; mounted off by {off} per axis" if off and noisy else "")
 
 
-def _sensor(scenario: Scenario, section: SensorSection) -> str:
-    """Return a sensor beside the camera in words."""
-    kind, own = section.made, [name for name in scenario.vehicle_names if section.is_on(name)]
-    stds = dict.fromkeys(f"{number(std)} {unit}" for std, unit in zip(section.white, kind.units, strict=True))
-    return _joined(
-        ", ",
-        section.label if section.label == section.kind else f"{section.label} ({section.kind})",
-        f"towards {' and '.join(kind.towards if section.towards is None else section.towards)}",
-        section.rate and f"{number(section.rate)} Hz",
-        section.range is not None and f"up to {number(section.range)} m",
-        len(own) < len(scenario.vehicles) and f"on {listed(own)}",
-        f"noise {' and '.join(stds)}" if scenario.noise.enabled else "no noise",
-    )
+def _sensor(section: SensorSection) -> str:
+    """Return a sensor beside the camera in words; the table of all sensors has its noise and limits."""
+    label = section.label if section.label == section.kind else f"{section.label} ({section.kind})"
+    towards = section.made.towards if section.towards is None else section.towards
+    return label if towards == ("map",) else f"{label} to {' and '.join(towards)}"
 
 
 def _lasting(noise: Noise) -> str:

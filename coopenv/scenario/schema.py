@@ -413,7 +413,7 @@ def _problems_of_driving(s: Scenario) -> Iterator[str]:
         yield "action.radio: no vehicle receives messages of another one here (v2x.links, vehicles.*.neighbours)"
     if s.reward.own_share and s.reward.team == "own":
         yield "reward.own_share: only with reward.team = 'mean' or 'min'"
-    decision = 1.0 / s.rates.decision
+    decision, checked = 1.0 / s.rates.decision, set[int]()
     for i, (vehicle, limits) in enumerate(zip(s.vehicles, s.limits, strict=True)):
         own = vehicle.dynamics is not None
         where, top = f"vehicles.{i}.dynamics" if own else "dynamics", limits.max_speed
@@ -423,7 +423,10 @@ def _problems_of_driving(s: Scenario) -> Iterator[str]:
         if limits.latency > decision:
             yield f"{where}.latency: {limits.latency:g} s is longer than one decision ({decision:g} s)"
         yield from (f"{where}.{problem}" for problem in _problems_of_drive(s, vehicle, limits))
-        for column in columns_of(limits) if limits.model in DRIVES else ():
+        if id(limits) in checked or limits.model not in DRIVES:
+            continue  # vehicles share the limits of the scenario
+        checked.add(id(limits))
+        for column in columns_of(limits):
             if (wanted := s.action.at_one(column)) > column.high:
                 above = f"{wanted:g} {column.unit} is above {where}.{column.limit} ({column.high:g} {column.unit})"
                 yield f"action.{column.name}: {above}"
