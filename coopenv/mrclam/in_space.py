@@ -13,30 +13,18 @@ one robot may differ by, so that a filter can estimate it (`coopenv.observers.la
 """
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.base.errors import DataError
 from coopenv.estimation.poses import Array, about_z
 from coopenv.measurements.sensor import MAP, Sensor
-from coopenv.mrclam.dataset import ROBOTS, Dataset, HeldCommands, Robot, arc
-from coopenv.mrclam.recording import (
-    DRIFT_STD,
-    GAINS,
-    MESSAGE_PERIOD_TICKS,
-    START_STD,
-    TICK_S,
-    Variant,
-    _moved,
-    _seen,
-    _truth,
-    check_variant,
-)
-from coopenv.observers.contract import Gains, SensorNoise, Setup
-from coopenv.observers.recording import Recording, check_recording, received_by_all
-from coopenv.observers.sensed import Truth
+from coopenv.mrclam.dataset import ROBOTS, Dataset, HeldCommands, arc
+from coopenv.mrclam.recording import TICK_S, Variant, recording_of, seen_by, start_of
+from coopenv.observers.contract import SensorNoise
+from coopenv.observers.recording import Recording, check_recording
 
 # The next constants were tuned on sub-dataset 6 (docs/data.md).
 LEAD_S = 0.2  # by which commands are ahead of the motion
@@ -67,88 +55,45 @@ FLOOR_PERIOD_TICKS = 40
 
 
 def spatial_recording_of(dataset: Dataset, variant: Variant) -> Recording:
-    """Put a sub-dataset on ticks.
-
-    Truth is NaN where motion capture is not valid. Every robot starts at its true pose; one that motion capture sees
-    later starts at the pose of backward dead reckoning from there. In the variant `landmarks` no robot sees another, in
-    `landmarks+robots` everything counts, and in `blind` robots 3 to 5 see robots only.
+    """Return a sub-dataset as `recording_of` does, but with calibrated odometry and with sensors beside the camera.
 
     Raises:
-        DataError: unknown variant, motion capture never sees a robot, or its data make no sense.
+        DataError: as for `recording_of`.
     """
-    check_variant(variant)
+    plane = recording_of(dataset, variant)
+    K, N, T = plane.visible.shape
     subjects = [*sorted(dataset.landmarks), *ROBOTS]
-    L, N = len(dataset.landmarks), len(ROBOTS)
-    T = L + N
-    t = np.arange(int(dataset.duration_s / TICK_S) + 1, dtype=np.float64) * TICK_S
-    K = len(t)
     column = np.zeros(max(subjects) + 1, dtype=np.int64)
     column[subjects] = np.arange(T)
-    arrays: dict[str, Any] = {
-        "rotation": np.broadcast_to(np.eye(3), (K, N, 3, 3)).copy(),
-        **{name: np.zeros((K, N, 3)) for name in ("translation", "velocity", "angular_velocity")},
-        "bearings": np.full((K, N, T, 3), np.nan),
-        "visible": np.zeros((K, N, T), bool),
-        "start_covariance": np.zeros((N, 6, 6)),
-    }
-    readings = {
-        "range": np.full((K, N, T, 1), np.nan),
-        "level": np.full((K, N, 1, 3), np.nan),
-        "height": np.full((K, N, 1, 3), np.nan),
-    }
+    readings = {"range": np.full((K, N, T, 1), np.nan)}
     for name in ("level", "height"):
+        readings[name] = np.full((K, N, 1, 3), np.nan)
         readings[name][1::FLOOR_PERIOD_TICKS] = 0.0
-    pose, start = np.zeros((K, N, 3)), np.zeros((N, 3))
+    moved: dict[str, Any] = {name: np.zeros((K, N, 3)) for name in ("translation", "velocity", "angular_velocity")}
+    rotation, start = np.tile(np.eye(3), (K, N, 1, 1)), np.zeros((N, 3))
+    R, position = plane.truth.rotation, plane.truth.position
+    pose = np.concatenate([position[..., :2], np.arctan2(R[..., 1, 0], R[..., 0, 0])[..., None]], axis=-1)
     for i, robot in enumerate(dataset.robots):
         held = HeldCommands(robot)
-        turn, path = _motion(held, t)
-        arrays["velocity"][1:, i, 0], arrays["angular_velocity"][1:, i, 2] = path / TICK_S, turn / TICK_S
-        arrays["translation"][1:, i, :2] = arc(np.zeros_like(turn), path, turn)
-        arrays["rotation"][1:, i] = about_z(turn)
-        k, seen, vectors, ranges = _seen(robot, variant, held, t)
+        turn, path = _motion(held, plane.t)
+        moved["velocity"][1:, i, 0], moved["angular_velocity"][1:, i, 2] = path / TICK_S, turn / TICK_S
+        moved["translation"][1:, i, :2] = arc(np.zeros_like(turn), path, turn)
+        rotation[1:, i] = about_z(turn)
+        k, seen, _, ranges = seen_by(robot, variant, held, plane.t)
         readings["range"][k, i, column[seen], 0] = ranges
-        arrays["bearings"][k, i, column[seen]], arrays["visible"][k, i, column[seen]] = vectors, True
-        pose[:, i] = _truth(robot, held, t)
-        start[i], arrays["start_covariance"][i] = _start(robot, _reckoned(turn, path), pose[:, i], t)
-    points = np.array([[*dataset.landmarks[subject], 0.0] for subject in sorted(dataset.landmarks)])
-    arrays["landmarks"] = np.broadcast_to(points, (K, L, 3))
-    arrays["start_rotation"], arrays["start_position"] = about_z(start[:, 2]), np.insert(start[:, :2], 2, 0.0, axis=1)
-    recording = Recording(
-        setups=_setups(sorted(dataset.landmarks)),
-        order=tuple(range(N)),
-        dt=TICK_S,
-        inbox_tick=received_by_all(K, N, MESSAGE_PERIOD_TICKS),
-        period=MESSAGE_PERIOD_TICKS,
-        staleness=math.inf,
-        due=np.ones(K, bool),
-        truth=Truth(about_z(pose[..., 2]), np.concatenate([pose[..., :2], 0.0 * pose[..., :1]], axis=-1)),
+        start[i], _ = start_of(robot, _reckoned(turn, path), pose[:, i], plane.t)
+    setups = tuple(replace(of, noise=NOISE, planar=False, sensors=_sensors(of.targets)) for of in plane.setups)
+    recording = replace(
+        plane,
+        setups=setups,
+        rotation=rotation,
+        start_rotation=about_z(start[:, 2]),
+        start_position=np.insert(start[:, :2], 2, 0.0, axis=1),
         readings=readings,
-        **arrays,
+        **moved,
     )
     check_recording(recording, dataset.name)
     return recording
-
-
-def _setups(subjects: list[int]) -> tuple[Setup, ...]:
-    known = [f"landmark_{s}" for s in subjects]
-    names, landmarks = (*known, *(f"vehicle_{s}" for s in ROBOTS)), len(known)
-    k, q, V, P0, max_turn = GAINS
-    gains = Gains(k, np.full(len(names), q), V, P0, max_turn)
-    return tuple(
-        Setup(
-            vehicle=i,
-            name=f"vehicle_{robot}",
-            target_names=names,
-            landmarks=landmarks,
-            targets=np.delete(np.arange(len(names)), landmarks + i),
-            lever_arm=np.zeros(3),
-            marker=np.zeros(3),
-            noise=NOISE,
-            gains=gains,
-            sensors=_sensors(np.delete(np.arange(len(names)), landmarks + i)),
-        )
-        for i, robot in enumerate(ROBOTS)
-    )
 
 
 def _sensors(targets: NDArray[np.int64]) -> tuple[Sensor, ...]:
@@ -174,13 +119,3 @@ def _reckoned(turn: Array, path: Array) -> Array:
     heading = np.concatenate([[0.0], np.cumsum(turn)])
     steps = np.concatenate([np.zeros((1, 2)), np.cumsum(arc(heading[:-1], path, turn), axis=0)])
     return np.column_stack([steps, heading])
-
-
-def _start(robot: Robot, reckoned: Array, pose: Array, t: Array) -> tuple[Array, Array]:
-    """Return the pose (3,) at tick 0 and its covariance (6, 6), LEFT coordinates."""
-    known = np.flatnonzero(np.isfinite(pose).all(axis=1))
-    if known.size == 0:
-        raise DataError(f"robot {robot.subject}: no ground truth while it records odometry")
-    first = known[:1]
-    variances = np.square(START_STD) + np.square(DRIFT_STD) * t[first]
-    return _moved(pose[first], reckoned[first], reckoned[:1])[0], np.diag(np.repeat(variances, 3))

@@ -77,10 +77,10 @@ def recording_of(dataset: Dataset, variant: Variant) -> Recording:
         arrays["velocity"][:, i, 0], arrays["angular_velocity"][:, i, 2] = held.commands(t)
         arrays["translation"][1:, i, :2] = _turned(np.diff(reckoned[:, :2], axis=0), -reckoned[:-1, 2])
         arrays["rotation"][1:, i] = about_z(turn)
-        k, seen, vectors, _ = _seen(robot, variant, held, t)
+        k, seen, vectors, _ = seen_by(robot, variant, held, t)
         arrays["bearings"][k, i, column[seen]], arrays["visible"][k, i, column[seen]] = vectors, True
         pose[:, i] = _truth(robot, held, t)
-        start[i], arrays["start_covariance"][i] = _start(robot, held, pose[:, i], t)
+        start[i], arrays["start_covariance"][i] = start_of(robot, reckoned, pose[:, i], t)
     points = np.array([[*dataset.landmarks[subject], 0.0] for subject in sorted(dataset.landmarks)])
     arrays["landmarks"] = np.broadcast_to(points, (K, L, 3))
     arrays["start_rotation"], arrays["start_position"] = about_z(start[:, 2]), np.insert(start[:, :2], 2, 0.0, axis=1)
@@ -132,7 +132,7 @@ def counted(robot: Robot, variant: Variant) -> NDArray[np.bool_]:
     return keep
 
 
-def _seen(
+def seen_by(
     robot: Robot, variant: Variant, held: HeldCommands, t: Array
 ) -> tuple[NDArray[Any], NDArray[Any], Array, Array]:
     """Return of what one robot's camera saw the ticks, the subjects, unit vectors (n, 3), and ranges (n,) in m."""
@@ -166,14 +166,24 @@ def _truth(robot: Robot, held: HeldCommands, t: Array) -> Array:
     return pose
 
 
-def _start(robot: Robot, held: HeldCommands, pose: Array, t: Array) -> tuple[Array, Array]:
-    """Return the pose (3,) at tick 0 and its covariance (6, 6), LEFT coordinates."""
+def start_of(robot: Robot, reckoned: Array, pose: Array, t: Array) -> tuple[Array, Array]:
+    """Return the pose (3,) at tick 0 and its covariance (6, 6), LEFT coordinates.
+
+    Args:
+        robot: whose error names it.
+        reckoned: (K, 3) x, y in m and heading in rad by odometry alone, from anywhere.
+        pose: (K, 3) true ones, NaN where not known.
+        t: (K,) s, of the ticks.
+
+    Raises:
+        DataError: no true pose is known.
+    """
     known = np.flatnonzero(np.isfinite(pose).all(axis=1))
     if known.size == 0:
         raise DataError(f"robot {robot.subject}: no ground truth while it records odometry")
     first = known[:1]
     variances = np.square(START_STD) + np.square(DRIFT_STD) * t[first]
-    return _moved(pose[first], held.pose(t[first]), held.pose(t[:1]))[0], np.diag(np.repeat(variances, 3))
+    return _moved(pose[first], reckoned[first], reckoned[:1])[0], np.diag(np.repeat(variances, 3))
 
 
 def _moved(pose: Array, before: Array, after: Array) -> Array:
