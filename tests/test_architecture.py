@@ -110,11 +110,24 @@ CORE_LINES = 48_000
 """Physical lines that the core, without guests, is to have at most; the owner alone raises it."""
 
 
+STILL_ABOVE = 7_177
+"""Lines by which the core exceeds its ceiling: the core grows no further, and this number only falls, to 0."""
+
+
+def core_lines() -> int:
+    """Return the physical lines of the core."""
+    core = {path for path in MODULES.values() if path.relative_to(PACKAGE).parts[0] not in GUESTS}
+    return sum(len(path.read_text(encoding="utf-8").splitlines()) for path in core)
+
+
+def test_the_core_grows_no_further() -> None:
+    lines = core_lines()
+    assert lines <= CORE_LINES + STILL_ABOVE, f"{lines} lines; python -m benchmarks.lines shows where they went"
+
+
 @pytest.mark.xfail(strict=True, reason="above the ceiling by 2,750 lines before sensors and drives, by 7,200 with them")
 def test_the_core_keeps_below_its_ceiling() -> None:
-    core = {path for path in MODULES.values() if path.relative_to(PACKAGE).parts[0] not in GUESTS}
-    lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in core)
-    assert lines <= CORE_LINES, f"{lines} lines; python -m benchmarks.lines shows where they went"
+    assert core_lines() <= CORE_LINES
 
 
 def test_numbers_of_robust_keep_their_budget() -> None:

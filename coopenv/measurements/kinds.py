@@ -1,5 +1,6 @@
 """Kinds of measurements: their interface, and the table of all shipped ones."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
@@ -117,7 +118,7 @@ class WarpFunctions(NamedTuple):
     beyond the kind's are zero."""
 
 
-class Kind:
+class Kind(ABC):
     """A kind of measurement; arrays may have leading axes (...) of a batch.
 
     A shipped kind computes batches; `coopenv.measurements.own` makes a kind of a user's class, which computes one
@@ -135,9 +136,9 @@ class Kind:
     under_sky = False  # True: what hides the sky above it occludes it, as for a receiver of satellites
     in_warp: WarpFunctions | None = None  # None: it is computed in NumPy alone
 
+    @abstractmethod
     def predict(self, own: Placed, target: Placed) -> Array:
         """Return values (..., size) without noise; `target` is the map's origin where the kind has no target."""
-        raise NotImplementedError
 
     @property
     def parts(self) -> tuple[tuple[str, int, str], ...]:

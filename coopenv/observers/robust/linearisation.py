@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import skew
+from coopenv.measurements.bearing import axes_across
 from coopenv.observers.robust.algebra import by_rows
 from coopenv.observers.robust.measurements import linearisation_variance
 from coopenv.observers.robust.memory import FOCAL_ERROR, BearingFrame, Derivative, Pose, mat26d, vec3d
@@ -14,13 +15,9 @@ from coopenv.world.warp_internals import device_function, subroutine
 
 @wp.func
 def tangent_basis(b: Any):
-    """Return two orthonormal rows across a unit vector (Duff et al., JCGT 6(1), 2017)."""
-    one = wp.float64(1.0)
-    sign = wp.where(b[2] < wp.float64(0.0), -one, one)
-    a = -one / (sign + b[2])
-    c = b[0] * b[1] * a
-    x = vec3d(one + sign * b[0] * b[0] * a, sign * c, -sign * b[0])
-    return wp.matrix_from_rows(x, vec3d(c, sign + b[1] * b[1] * a, -b[1]))
+    """Return two orthonormal rows (2, 3) across a unit vector."""
+    first, second = axes_across(b)
+    return wp.matrix_from_rows(first, second)
 
 
 @subroutine
