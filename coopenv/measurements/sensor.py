@@ -3,7 +3,7 @@
 import json
 import math
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -80,10 +80,14 @@ class Sensor:
     options: str = "{}"  # arguments of a user's class, JSON
     std_by_distance: float = 0.0  # of the noise beside `std`, per m to the target
 
-    @property
+    @cached_property
     def kind(self) -> Kind:
-        """Kind of measurement."""
+        """Kind of measurement, looked up once."""
         return kept_kind(self.reference, self.options)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields: another process looks the kind up again."""
+        return {name: value for name, value in vars(self).items() if name != "kind"}
 
     def placed(self, R: Array, p: Array, velocity: Array, angular_velocity: Array, landmarks: Any = NOTHING) -> Placed:
         """Return where it is on a body at R (..., 3, 3), p (..., 3) with a twist (..., 3) in body axes."""
