@@ -12,6 +12,7 @@ Small matrices are multiplied and eliminated by loops: up to about ten rows BLAS
 no slower, but takes seconds to compile in every function that uses it.
 """
 
+import math
 import os
 from collections.abc import Callable
 from contextlib import suppress
@@ -181,6 +182,15 @@ def eliminated(A: Array, B: Array) -> Array:
 exp_so3 = compiled(VECTOR)(poses.exp_so3)
 right_jacobian = compiled(VECTOR)(poses.right_jacobian)
 exp_translation = compiled(VECTOR, VECTOR)(poses.exp_translation)
+
+
+@compiled(MATRIX)
+def logarithm(R: Array) -> Array:
+    """Return the rotation vector (3,) of R (3, 3), rad, to be used away from half a turn."""
+    v = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    angle = math.atan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
+    return v * (angle / sine if sine > 1e-9 else 1.0)
 
 
 @compiled(MATRIX)

@@ -39,13 +39,8 @@ from coopenv.estimation.poses import Array, exp_so3, orthonormalise, skew
 from coopenv.observers import uncertain_pose
 from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick
 from coopenv.observers.correction import InnovationGate, Stacked, gain, joseph
-from coopenv.observers.frame import (
-    LinearMeasurements,
-    UsableMeasurements,
-    linearised,
-    measured_message,
-    usable_measurements,
-)
+from coopenv.observers.frame import UsableMeasurements, measured_message, usable_measurements
+from coopenv.observers.linearisation import LinearMeasurements, linearised
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, transition
 
 
@@ -118,7 +113,7 @@ class Centralised:
     def correct(self, ticks: Sequence[Tick], measured: Mapping[int, UsableMeasurements]) -> None:
         """Correct by the measurements of vehicles that pass the vehicles' gates, in one update."""
         before, P = self.poses, self.P
-        linear = {i: self.linearise(i, ticks[i], of) for i, of in measured.items()}
+        linear = {i: self.linearise(i, of) for i, of in measured.items()}
         kept = {i: self.gates[i].passed(ticks[i].time, of, of.spread(P)) for i, of in linear.items()}
         residual, H, N = _stacked([of.only(kept[i]) for i, of in linear.items()])
         if not len(residual):
@@ -128,23 +123,22 @@ class Centralised:
             at = 0.5 * dx
             self.poses = self.moved(before, at)
             again = {i: of.only(kept[i]) for i, of in self.measured(ticks).items()}
-            residual, H, N = _stacked([self.linearise(i, ticks[i], of) for i, of in again.items()])
+            residual, H, N = _stacked([self.linearise(i, of) for i, of in again.items()])
             H = H.dot(self.recentring(at))
             K, dx, _ = gain(P, H, N, residual + H.dot(at))
         G = self.recentring(dx)
         self.poses, self.P = self.moved(before, dx), G.dot(joseph(P, K, H, N)).dot(G.T)
 
-    def linearise(self, i: int, tick: Tick, measured: UsableMeasurements) -> LinearMeasurements:
+    def linearise(self, i: int, measured: UsableMeasurements) -> LinearMeasurements:
         """Return measurements of vehicle i, linearised by all errors."""
-        own = linearised(UncertainPose(LEFT, *self.poses[i], self.P), tick, measured)
+        own = linearised(UncertainPose(LEFT, *self.poses[i], self.P), measured)
         H = np.zeros((*own.residual.shape, len(self.P)))
         H[:, :, self.block(i)] = own.H
         for n, target in enumerate(measured.targets.tolist()):
             if (j := target - self.landmarks) >= 0:
-                G = own.G[n].dot(self.poses[j][0])
-                H[n, :, self.block(j)] = np.concatenate([G.dot(skew(-self.markers[j])), G], axis=1)
-                if own.turn is not None:
-                    H[n, :, self.block(j)][:, :3] += own.turn[n]
+                G = own.by_target[n, :, 3:].dot(self.poses[j][0])
+                turn = own.by_target[n, :, :3] + G.dot(skew(-self.markers[j]))
+                H[n, :, self.block(j)] = np.concatenate([turn, G], axis=1)
         return own._replace(H=H)
 
     @staticmethod
@@ -206,9 +200,9 @@ class FirstEstimatesEkf(Centralised):
             F[6 * i + 3 : 6 * i + 6, 6 * i : 6 * i + 3] = skew(self.first[i] - p - R.dot(tick.translation))
         return F
 
-    def linearise(self, i: int, tick: Tick, measured: UsableMeasurements) -> LinearMeasurements:
+    def linearise(self, i: int, measured: UsableMeasurements) -> LinearMeasurements:
         """Return measurements of vehicle i, linearised by all errors."""
-        linear = super().linearise(i, tick, measured)
+        linear = super().linearise(i, measured)
         return linear._replace(H=self.turned(linear.H))
 
     @staticmethod
@@ -240,9 +234,9 @@ class ObservabilityConstrainedEkf(FirstEstimatesEkf):
         NT = np.swapaxes(N, -1, -2)
         self.projection = N @ np.linalg.solve(NT @ N, NT)  # (N, N, 12, 12)
 
-    def linearise(self, i: int, tick: Tick, measured: UsableMeasurements) -> LinearMeasurements:
+    def linearise(self, i: int, measured: UsableMeasurements) -> LinearMeasurements:
         """Return measurements of vehicle i, linearised by all errors."""
-        linear = super().linearise(i, tick, measured)
+        linear = super().linearise(i, measured)
         targets = measured.targets - self.landmarks
         rows = np.flatnonzero(targets >= 0)
         j = targets[rows]

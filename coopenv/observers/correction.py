@@ -40,17 +40,14 @@ from coopenv.estimation.compiled import (
     transformed,
 )
 from coopenv.estimation.poses import Array, solve
-from coopenv.observers.contract import Tick
-from coopenv.observers.frame import (
-    FRAME,
-    Frame,
+from coopenv.observers.frame import CAMERA, ENTRY, FRAME, RECORDS, Frame, UsableMeasurements
+from coopenv.observers.linearisation import (
+    FLAG_ROWS,
+    FLAGS,
     LinearMeasurements,
-    UsableMeasurements,
-    dense,
-    frame_of,
     linearise,
-    linearised,
     normalised,
+    stacked,
 )
 from coopenv.observers.uncertain_pose import RIGHT, UncertainPose, corrected, moved, recentring
 
@@ -90,37 +87,15 @@ def joseph(P: Array, K: Array, H: Array, N: Array) -> Array:
     return after
 
 
-def halfway(P: Array, look: Look, own: int = 6) -> tuple[Array, Array, Array, Array, float]:
-    """Return (K, H, N, dx, r^T S^-1 r at the prediction) of a correction that is linearised half way.
-
-    `halfway_gain` does the same for bearings. Errors after the `own` first stay as they are.
-    """
-    at = np.zeros(len(P))
-    residual, H, N = look(at)
-    _, dx, nis = gain(P, H, N, residual)
-    at[:own] = 0.5 * dx[:own]
-    residual, H, N = look(at)
-    K, dx, _ = gain(P, H, N, residual + H.dot(at))
-    return K, H, N, dx, nis
-
-
-def look_from(state: UncertainPose, tick: Tick, measured: UsableMeasurements) -> Look:
+def look_from(state: UncertainPose, measured: UsableMeasurements) -> Look:
     """Return measurements as a function of the own error about a predicted pose."""
+    turns, places = np.zeros((0, 3, 3)), np.full(len(measured.entries), -1)
 
     def look(at: Array) -> Stacked:
-        residual, H, N = linearised(state.moved(at, state.P), tick, measured).stacked()
-        return residual, H.dot(recentring(state.kind, at)), N
+        seen: Stacked = looked(state.kind, state.R, state.p, at, measured.frame, NO_CONSTANTS, turns, places)
+        return seen
 
     return look
-
-
-def corrected_pose(state: UncertainPose, tick: Tick, measured: UsableMeasurements) -> tuple[UncertainPose, float]:
-    """Return a predicted pose corrected by measurements, and r^T S^-1 r at the prediction."""
-    if measured.others is None:
-        *pose, nis = updated(*state, frame_of(tick, measured))
-        return UncertainPose(state.kind, *pose), float(nis)
-    K, H, N, dx, nis = halfway(state.P, look_from(state, tick, measured))
-    return state.corrected(dx, joseph(state.P, K, H, N)), nis
 
 
 def turn_of_sight(dx: Array, distance: float) -> float:
@@ -129,8 +104,8 @@ def turn_of_sight(dx: Array, distance: float) -> float:
     return float(max(size[0], size[1] / distance))
 
 
-def iterated(P: Array, look: Look, bend: Callable[[Array], float]) -> tuple[Array, Array, float]:
-    """Return (dx, P+, r^T S^-1 r at the prediction) of an update iterated to convergence.
+def iterated(P: Array, look: Look, bend: Callable[[Array], float]) -> tuple[Array, Array, float, int]:
+    """Return (dx, P+, r^T S^-1 r at the prediction, number of rows) of an update iterated to convergence.
 
     Steps are halved until the cost x^T P^-1 x + r^T N^-1 r falls. `bend` returns the angle by which an error (n,) turns
     a line of sight, rad.
@@ -157,7 +132,7 @@ def iterated(P: Array, look: Look, bend: Callable[[Array], float]) -> tuple[Arra
         K, dx, _ = gain(P, H, N, residual + H.dot(at))
         if bend(step) < CLOSE:
             break
-    return at, joseph(P, K, H, N), nis
+    return at, joseph(P, K, H, N), nis, len(N)
 
 
 LARGEST = 13.8155  # 0.999 of a chi-square of 2: -2 log 0.001
@@ -186,9 +161,7 @@ class InnovationGate:
             linear: the measurements.
             S: (m, r, r) covariances of their residuals; a measurement with an invalid one is never accepted.
         """
-        bearings_alone = linear.used is None
-        made = judged(linear.residual, S, linear.ahead) if bearings_alone else judged_of_all(linear, S)
-        definite, fits, rejected, widest = made
+        definite, fits, rejected, widest = judged(linear.residual, S, linear.used, linear.angle, linear.ahead)
         self.share += (rejected - self.share) * min(1.0, max(0.0, time - self.time) / AVERAGING)
         if widest > WIDE:
             self.share = 1.0
@@ -198,93 +171,132 @@ class InnovationGate:
         return taken
 
 
-Judged = tuple[NDArray[np.bool_], NDArray[np.bool_], float, float]
-"""(m,) which S are covariances, (m,) which measurements fit, the share of the others, and the largest trace, rad^2."""
+@compiled(MATRIX, MATRICES, FLAG_ROWS, FLAG_ROWS, FLAGS)
+def judged(
+    residual: Array, S: Array, used: NDArray[np.bool_], angle: NDArray[np.bool_], ahead: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], float, float]:
+    """Return (m,) which S are covariances, (m,) which measurements fit, the share of the others, and the largest trace.
 
-
-@compiled(MATRIX, MATRICES, types.Array(types.boolean, 1, "A", readonly=True))
-def judged(residual: Array, S: Array, in_front: NDArray[np.bool_]) -> Judged:
-    """Return how bearings with residuals (m, 2) and their covariances (m, 2, 2) are judged."""
-    squared = normalised(residual, S)
-    definite = squared >= 0.0
-    fits = definite & (squared <= LARGEST) & in_front
-    widest = np.max(S[:, 0, 0] + S[:, 1, 1])
+    The trace is that of the rows that measure an angle, rad^2. Arguments are as for `LinearMeasurements`.
+    """
+    squared, widest = normalised(residual, S), 0.0
+    definite, fits = np.empty(len(S), np.bool_), np.empty(len(S), np.bool_)
+    for n in range(len(S)):
+        dof, trace = np.count_nonzero(used[n]), 0.0
+        for k in range(residual.shape[1]):
+            trace += S[n, k, k] if angle[n, k] else 0.0
+        definite[n] = squared[n] >= 0.0 and dof > 0
+        fits[n] = definite[n] and squared[n] <= LARGEST_OF[dof] and ahead[n]
+        widest = max(widest, trace)
     return definite, fits, 1.0 - np.count_nonzero(fits) / len(fits), widest
-
-
-def judged_of_all(linear: LinearMeasurements, S: Array) -> Judged:
-    """Return the same of the measurements of any sensors; only angles are wide."""
-    assert linear.used is not None and linear.angles is not None
-    squared = np.einsum("mr,mr->m", linear.residual, np.linalg.solve(S, linear.residual[..., None])[..., 0])
-    definite = (squared >= 0.0) & linear.used.any(axis=1)
-    fits = definite & (squared <= LARGEST_OF[linear.used.sum(axis=1)]) & linear.ahead
-    variances = np.where(linear.angles & linear.used, np.diagonal(S, axis1=1, axis2=2), 0.0)
-    return definite, fits, 1.0 - float(fits.mean()), float(variances.sum(axis=1).max())
 
 
 PLACES = types.Array(types.int64, 1, "A", readonly=True)
 
 
+CONSTANTS = types.Tuple((MATRIX, VECTOR))
+Constants = tuple[Array, Array]
+"""Constants of the camera behind the own pose in a state: the left error of the pose (6, c) that moves bearings as each
+of the constants does, and their values (c,)."""
+NO_CONSTANTS = np.zeros((6, 0)), np.zeros(0)
+
+
+@compiled(MATRIX, MATRICES, RECORDS[ENTRY], CONSTANTS)
+def with_constants(residual: Array, H: Array, entries: NDArray[Any], constants: Constants) -> tuple[Array, Array]:
+    """Return residuals (m, r) less what constants explain, and H (m, r, 6 + c)."""
+    by_pose, values = constants
+    (m, r, _), c = H.shape, len(values)
+    if c == 0:
+        return residual, H
+    residual, whole = residual.copy(), np.zeros((m, r, 6 + c))
+    for n in range(m):
+        place(whole[n], 0, 0, H[n])
+        if entries.sensor[n] == CAMERA:
+            columns = product(H[n], by_pose)
+            place(whole[n], 0, 6, columns)
+            explained = transformed(columns, values)
+            for k in range(r):
+                residual[n, k] -= explained[k]
+    return residual, whole
+
+
 @compiled(MATRICES, MATRICES, MATRIX, MATRICES, PLACES)
-def joint_jacobian(H: Array, G: Array, recentring: Array, turns: Array, places: Any) -> Array:
-    """Return (rm, n + 6k) the derivative of m measurements by the own error and those of k neighbours' places.
+def joint_jacobian(H: Array, by_target: Array, recentring: Array, turns: Array, places: Any) -> Array:
+    """Return (m, r, n + 6k) the derivative of m measurements by the own error and those of k neighbours.
 
     Args:
         H: (m, r, n) by the error about where it is linearised.
-        G: (m, r, 3) by the points, map axes.
-        recentring: (n, n) of the own error.
+        by_target: (m, r, 6) as in `LinearMeasurements`.
+        recentring: (6, 6) of the error of the own pose.
         turns: (k, 3, 3) the neighbours' orientations.
-        places: (m,) the neighbour of each bearing, -1: none.
+        places: (m,) the neighbour of each measurement, -1: none.
     """
-    r, own = H.shape[1:]
-    whole = np.zeros((r * len(H), own + 6 * len(turns)))
-    for n in range(len(H)):
-        place(whole, r * n, 0, product(H[n], recentring))
+    m, r, own = H.shape
+    whole = np.zeros((m, r, own + 6 * len(turns)))
+    for n in range(m):
+        place(whole[n], 0, 0, H[n])
+        place(whole[n], 0, 0, product(H[n, :, :6], recentring))
         k = places[n]
         if k >= 0:
-            place(whole, r * n, own + 6 * k + 3, product(G[n], turns[k]))
+            place(whole[n], 0, own + 6 * k, by_target[n, :, :3])
+            place(whole[n], 0, own + 6 * k + 3, product(by_target[n, :, 3:], turns[k]))
     return whole
 
 
-@compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME, MATRICES, PLACES)
-def halfway_gain(
-    kind: int, R: Array, p: Array, P: Array, frame: Frame, turns: Array, places: Any
-) -> tuple[Array, Array, Array, Array, float]:
-    """Return (K (n, 2m), H, N, dx (n,), r^T S^-1 r at the prediction) of the correction of a prediction.
+@compiled(WHOLE, MATRIX, VECTOR, VECTOR, FRAME, CONSTANTS, MATRICES, PLACES)
+def looked(
+    kind: int, R: Array, p: Array, at: Array, frame: Frame, constants: Constants, turns: Array, places: Any
+) -> Stacked:
+    """Return residual (k,), H (k, n) and N (k, k), linearised at a predicted pose that is moved by errors (n,).
 
-    H (2m, n) and N (2m, 2m) are those half way, where the poses of neighbours stay as they are.
+    The poses of neighbours stay as they are. Arguments are those of `halfway_gain`.
+    """
+    R, p = moved(kind, R, p, at[:6])
+    residual, H, N, by_target, _, used, _, _ = linearise(R, p, kind == RIGHT, frame)
+    by_pose, values = constants
+    residual, H = with_constants(residual, H, frame[0], (by_pose, values + at[6 : 6 + len(values)]))
+    whole = joint_jacobian(H, by_target, recentring(kind, at[:6]), turns, places)
+    return stacked(residual, whole, N, by_target, used, frame[0])
+
+
+@compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME, CONSTANTS, MATRICES, PLACES)
+def halfway_gain(
+    kind: int, R: Array, p: Array, P: Array, frame: Frame, constants: Constants, turns: Array, places: Any
+) -> tuple[Array, Array, Array, Array, float]:
+    """Return (K (n, k), H, N, dx (n,), r^T S^-1 r at the prediction) of the correction of a prediction.
+
+    H (k, n) and N (k, k) are those half way, where the poses of neighbours stay as they are.
 
     Args:
         kind: of the own error.
         R: (3, 3) the own orientation.
         p: (3,) the own position.
-        P: (n, n) = (6 + 6k, 6 + 6k) covariance of the own error and those of k neighbours.
-        frame: the bearings.
+        P: (n, n) covariance of the own error, of c constants, and of the errors of some neighbours.
+        frame: the measurements.
+        constants: of the camera.
         turns: see `joint_jacobian`.
         places: see `joint_jacobian`.
     """
-    residual, H, N, G, _ = linearise(R, p, kind == RIGHT, *frame)
-    whole = joint_jacobian(H, G, np.eye(6), turns, places)
-    _, dx, nis = gain(P, whole, dense(N), residual.ravel())
-    at = 0.5 * dx
-    at[6:] = 0.0
-    R, p = moved(kind, R, p, at[:6])
-    residual, H, N, G, _ = linearise(R, p, kind == RIGHT, *frame)
-    whole = joint_jacobian(H, G, recentring(kind, at[:6]), turns, places)
-    noise = dense(N)
-    K, dx, _ = gain(P, whole, noise, residual.ravel() + transformed(whole, at))
-    return K, whole, noise, dx, nis
+    at = np.zeros(len(P))
+    residual, H, N = looked(kind, R, p, at, frame, constants, turns, places)
+    _, dx, nis = gain(P, H, N, residual)
+    for n in range(6 + len(constants[1])):
+        at[n] = 0.5 * dx[n]
+    residual, H, N = looked(kind, R, p, at, frame, constants, turns, places)
+    K, dx, _ = gain(P, H, N, residual + transformed(H, at))
+    return K, H, N, dx, nis
 
 
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)
 def own_gain(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, Array, float]:
-    """Return the result of `halfway_gain` without neighbours."""
-    return halfway_gain(kind, R, p, P, frame, np.zeros((0, 3, 3)), np.full(len(frame[1]), -1))
+    """Return the result of `halfway_gain` without neighbours and constants."""
+    none = np.zeros((6, 0)), np.zeros(0)
+    return halfway_gain(kind, R, p, P, frame, none, np.zeros((0, 3, 3)), np.full(len(frame[0]), -1))
 
 
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)
-def updated(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, float]:
-    """Return R (3, 3), p (3,) in m, P (6, 6) and r^T S^-1 r of the correction of a prediction of covariance P."""
+def updated(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, float, int]:
+    """Return R (3, 3), p (3,) in m, P (6, 6), r^T S^-1 r and the number of rows of the correction of a prediction."""
     K, H, N, dx, nis = own_gain(kind, R, p, P, frame)
     R, p, P = corrected(kind, R, p, dx, joseph(P, K, H, N))
-    return R, p, P, nis
+    return R, p, P, nis, len(N)

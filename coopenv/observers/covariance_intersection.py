@@ -30,8 +30,9 @@ import numpy as np
 from coopenv.estimation.compiled import MATRIX, NUMBER, VECTOR, WHOLE, compiled, congruent
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Tick
-from coopenv.observers.correction import corrected_pose, halfway, joseph, look_from, own_gain
-from coopenv.observers.frame import FRAME, Frame, UsableMeasurements, frame_of, linearised
+from coopenv.observers.correction import joseph, own_gain
+from coopenv.observers.frame import FRAME, Frame, UsableMeasurements
+from coopenv.observers.linearisation import linearise, linearised
 from coopenv.observers.pose_filters import Mekf
 from coopenv.observers.uncertain_pose import RIGHT, UncertainPose, corrected, recentring
 
@@ -81,13 +82,6 @@ def best_weight(prior: Array, own: Array, theirs: Array) -> float:
     return high if -4.0 * log(high) + log(f / g) < 0.0 else 1.0
 
 
-@compiled(MATRIX, MATRIX, MATRIX, NUMBER)
-def weight(P: Array, H: Array, N: Array, variance: float) -> float:
-    """Return w for one bearing whose own noise has a variance; 1 if the neighbour's position is too uncertain."""
-    own = variance * np.eye(2)
-    return best_weight(congruent(H, P), own, N - own) if N[0, 0] + N[1, 1] < VAGUE else 1.0
-
-
 class CovarianceIntersection(Mekf):
     """Kalman filter; neighbours by covariance intersection.
 
@@ -97,21 +91,22 @@ class CovarianceIntersection(Mekf):
 
     sends_covariance = True
 
-    def correct(self, tick: Tick, measured: UsableMeasurements) -> None:
+    def correct(self, measured: UsableMeasurements) -> None:
         """Correct by the landmarks, then by neighbours one at a time."""
         known = np.array([m is None or m.covariance is None for m in measured.messages])
-        self.correct_in_turn(tick, measured, known)
+        self.correct_in_turn(measured, known)
 
-    def fuse_neighbour(self, tick: Tick, one: UsableMeasurements) -> None:
-        """Fuse one bearing to a neighbour with the covariance of its position."""
-        state, linear = self.state, linearised(self.state, tick, one)
-        own = linear.N[0] if one.others is None else linearised(state, tick, one.exact()).N[0]
-        if one.others is None:
-            w = weight(state.P, linear.H[0], linear.N[0], tick.noise.bearing_std**2)
+    def fuse_neighbour(self, one: UsableMeasurements) -> None:
+        """Fuse one measurement of a neighbour with the covariance of its position."""
+        state, linear = self.state, linearised(self.state, one)
+        H, N, own = linear.H[0], linear.N[0], np.diag(linear.variance[0])
+        if len(N) == 2:
+            w = best_weight(congruent(H, state.P), own, N - own) if N[0, 0] + N[1, 1] < VAGUE else 1.0
         else:
-            w = best_split_weight(state.P, np.zeros((6, 6)), linear.H[0], linear.N[0], own)
+            w = best_split_weight(state.P, np.zeros((6, 6)), H, N, own)
         if w < 1.0:
-            self.state, _ = corrected_pose(state._replace(P=state.P / w), tick, one.inflated(1.0 / (1.0 - w)))
+            self.state = state._replace(P=state.P / w)
+            self.fuse(one.inflated(1.0 / (1.0 - w)))
 
 
 class DistributedInvariant(CovarianceIntersection):
@@ -166,12 +161,14 @@ def best_split_weight(P_d: Array, P_i: Array, H: Array, N: Array, R_i: Array) ->
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, MATRIX, FRAME)
 def updated_parts(
     kind: int, R: Array, p: Array, P: Array, P_i: Array, frame: Frame
-) -> tuple[Array, Array, Array, Array, float]:
-    """Return pose, P, P_i and r^T S^-1 r of a correction of a prediction of covariance P."""
+) -> tuple[Array, Array, Array, Array, float, int]:
+    """Return pose, P, P_i, r^T S^-1 r and the number of rows of a correction of a prediction of covariance P."""
     K, H, N, dx, nis = own_gain(kind, R, p, P, frame)
-    P_i = congruent(recentring(kind, dx), joseph(P_i, K, H, frame[4] * np.eye(len(H))))
+    variance, used = linearise(R, p, kind == RIGHT, frame)[4:6]
+    R_i = np.diag(variance.ravel()[used.ravel()])
+    P_i = congruent(recentring(kind, dx), joseph(P_i, K, H, R_i))
     R, p, P = corrected(kind, R, p, dx, joseph(P, K, H, N))
-    return R, p, P, P_i, nis
+    return R, p, P, P_i, nis, len(N)
 
 
 class SplitCovarianceIntersection(CovarianceIntersection):
@@ -190,23 +187,16 @@ class SplitCovarianceIntersection(CovarianceIntersection):
         self.independent = self.state._replace(P=self.independent).predicted(tick).P
         super().predict(tick)
 
-    def fuse_neighbour(self, tick: Tick, one: UsableMeasurements) -> None:
-        """Fuse one bearing to a neighbour with the covariance of its position."""
-        P, P_i, linear = self.state.P, self.independent, linearised(self.state, tick, one)
-        own = linearised(self.state, tick, one.exact()).N[0]
-        w = best_split_weight(P - P_i, P_i, linear.H[0], linear.N[0], own)
+    def fuse_neighbour(self, one: UsableMeasurements) -> None:
+        """Fuse one measurement of a neighbour with the covariance of its position."""
+        P, P_i, linear = self.state.P, self.independent, linearised(self.state, one)
+        w = best_split_weight(P - P_i, P_i, linear.H[0], linear.N[0], np.diag(linear.variance[0]))
         if w < 1.0:
             self.state = self.state._replace(P=(P - P_i) / w + P_i)
-            self.fuse(tick, one.inflated(1.0 / (1.0 - w)))
+            self.fuse(one.inflated(1.0 / (1.0 - w)))
 
-    def fuse(self, tick: Tick, measured: UsableMeasurements) -> float:
-        """Correct by bearings; return their normalised innovation squared."""
-        if measured.others is None:
-            *pose, self.independent, nis = updated_parts(*self.state, self.independent, frame_of(tick, measured))
-            self.state = UncertainPose(self.kind, *pose)
-            return float(nis)
-        state, own = self.state, linearised(self.state, tick, measured.exact()).noise()
-        K, H, N, dx, nis = halfway(state.P, look_from(state, tick, measured))
-        self.independent = congruent(recentring(state.kind, dx), joseph(self.independent, K, H, own))
-        self.state = state.corrected(dx, joseph(state.P, K, H, N))
-        return nis
+    def fuse(self, measured: UsableMeasurements) -> tuple[float, int]:
+        """Correct by measurements; return their normalised innovation squared and their number of rows."""
+        *pose, self.independent, nis, dof = updated_parts(*self.state, self.independent, measured.frame)
+        self.state = UncertainPose(self.kind, *pose)
+        return float(nis), dof

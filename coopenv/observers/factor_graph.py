@@ -18,7 +18,8 @@ from coopenv.estimation.compiled import adjoint
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Estimate, Setup, Tick
 from coopenv.observers.correction import InnovationGate
-from coopenv.observers.frame import linearised, usable_measurements
+from coopenv.observers.frame import usable_measurements
+from coopenv.observers.linearisation import linearised
 from coopenv.observers.pose_filters import PoseObserver, unit
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose
 
@@ -103,15 +104,15 @@ class FactorGraph(PoseObserver):
     def collect(self, tick: Tick) -> None:
         """Add up the residuals of a frame."""
         usable, R, p = usable_measurements(tick), self.state.R, self.state.p
-        if usable is None or not len((measured := usable.of_camera()).targets):
+        if usable is None or not len((measured := usable.of_camera()).entries):
             return
-        linear = linearised(self.state, tick, measured)
+        linear = linearised(self.state, measured)
         S = linear.spread(self.state.P)
         measured = measured.only(self.gate.passed(tick.time, linear, S))
         for n, target in enumerate(measured.targets.tolist()):
             position = measured.positions[n]
             seen = self.residuals.setdefault(target, Residuals())
-            seen.position, seen.covariance = position, measured.covariances[n]
+            seen.position, seen.covariance = position, measured.entries["covariance"][n, 3:, 3:]
             seen.total = seen.total + R @ (measured.bearings[n] - unit((position - p) @ R - self.lever_arm))
             seen.count += 1
 

@@ -29,13 +29,15 @@ from coopenv.estimation.compiled import (
     VECTOR,
     compiled,
     cross_matrix,
+    logarithm,
     product,
     transformed,
 )
 from coopenv.estimation.poses import Array, orthonormalise, skew
 from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick
 from coopenv.observers.correction import LARGEST, LARGEST_OF, PLACES, InnovationGate
-from coopenv.observers.frame import CAMERA, across, linearised, measured_message, put_derivative, usable_measurements
+from coopenv.observers.frame import CAMERA, measured_message, usable_measurements
+from coopenv.observers.linearisation import across, linearised, put_derivative
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, moved
 
 LEAST_STD = 1e-6  # rad and m, of an odometry increment: without noise its information would be infinite
@@ -161,10 +163,9 @@ class FrameGraph:
             return
         measured = measured.only(factors.kept)
         pose = UncertainPose(LEFT, self.R[frame, i], self.p[frame, i], np.zeros((6, 6)))
-        linear = linearised(pose, factors.tick, measured)
-        weight = 1.0 / np.diagonal(linear.N, axis1=1, axis2=2)
+        linear = linearised(pose, measured)
+        weight = 1.0 / linear.variance
         squared = (linear.residual**2 * weight).sum(axis=1)
-        assert linear.used is not None and linear.turn is not None
         largest = LARGEST_OF[linear.used.sum(axis=1)]
         count[i] += len(squared), (squared > largest).sum()
         if self.vehicles[3][i]:
@@ -175,8 +176,8 @@ class FrameGraph:
             J[:, :6], J[:, 12] = linear.H[n], linear.residual[n]
             if j >= 0:
                 R = self.R[frame, j]
-                J[:, 6:9] = linear.turn[n] - linear.G[n].dot(R).dot(skew(self.markers[j]))
-                J[:, 9:12] = linear.G[n].dot(R)
+                J[:, 9:12] = linear.by_target[n, :, 3:].dot(R)
+                J[:, 6:9] = linear.by_target[n, :, :3] - J[:, 9:12].dot(skew(self.markers[j]))
             information[i, j if j >= 0 else i] += J[:, :12].T.dot(weight[n][:, None] * J)
 
     def odometry(self, frame: int) -> Array:
@@ -237,12 +238,12 @@ class GraphEstimator(ABC):
         if (measured := usable_measurements(reported)) is None:
             return
         pose = UncertainPose(LEFT, graph.R[k, vehicle], graph.p[k, vehicle], self.P[vehicle])
-        linear = linearised(pose, tick, measured)
+        linear = linearised(pose, measured)
         kept = self.gates[vehicle].passed(tick.time, linear, linear.spread(pose.P))
         bearings = measured.only(kept).of_camera()
         graph.add(vehicle, bearings.targets, bearings.bearings, bearings.positions)
-        if measured.others is not None:
-            graph.add_others(vehicle, ticks, kept[measured.others.sensor != CAMERA])
+        if len(measured.sensors) > 1:
+            graph.add_others(vehicle, ticks, kept[measured.entries["sensor"] != CAMERA])
 
     def broadcast(self, ticks: Sequence[Tick]) -> list[Message]:
         """Return the measurements of this tick, which every vehicle sends: odometry and bearings."""
@@ -264,15 +265,6 @@ def moved_poses(R: Array, p: Array, dx: Array) -> None:
         for i in range(len(R[k])):
             turned, shifted = moved(LEFT, R[k, i], p[k, i], dx[k, i])
             R[k, i], p[k, i] = 1.5 * turned - product(0.5 * turned, product(turned.T, turned)), shifted
-
-
-@compiled(MATRIX)
-def logarithm(R: Array) -> Array:
-    """Return the rotation vector (3,) of R (3, 3), rad, to be used away from half a turn."""
-    v = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    sine = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    angle = math.atan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
-    return v * (angle / sine if sine > 1e-9 else 1.0)
 
 
 @compiled(MATRICES, MATRIX, MATRICES, MATRIX, MATRICES, MATRIX)

@@ -12,7 +12,6 @@ import numpy as np
 from coopenv.estimation.compiled import cross_matrix, exp_so3, right_jacobian
 from coopenv.estimation.poses import Array, log_so3
 from coopenv.observers.contract import SensorNoise, Tick
-from coopenv.observers.frame import BEARING_ROWS, CAMERA, LinearMeasurements, UsableMeasurements
 
 SCALE, TURN_SCALE, CURVATURE, LOSS, LEAD = 0, 1, 5, 6, 7
 GYRO, ORIENTATION = slice(2, 5), slice(8, 11)
@@ -68,18 +67,12 @@ class LastingErrors:
         by_errors = np.concatenate([right_jacobian(turn) @ J[:3], rotation.T @ J[3:]])
         return CalibratedStep(rotation, move, by_errors)
 
-    def on_bearings(
-        self, linear: LinearMeasurements, tick: Tick, measured: UsableMeasurements, values: Array
-    ) -> LinearMeasurements:
-        """Return linearised measurements (m, r, 6) with derivatives (m, r, 6 + c), less what values (c,) explain.
+    def by_pose(self, lever_arm: Array) -> Array:
+        """Return the left errors (6, c) of the pose that move bearings of the camera as the lasting errors do.
 
         An error of the camera's orientation moves a bearing as a turn of the vehicle about the camera.
         """
-        by_orientation = np.zeros((*linear.residual.shape, STATES))
-        of_camera = slice(None) if measured.others is None else measured.others.sensor == CAMERA
-        H = linear.H[of_camera, :BEARING_ROWS]
-        about_camera = H[..., :3] + H[..., 3:] @ cross_matrix(np.asarray(tick.lever_arm, float))
-        by_orientation[of_camera, :BEARING_ROWS, ORIENTATION] = about_camera
-        columns = by_orientation[..., self.states]
-        H = np.concatenate([linear.H, columns], axis=-1)
-        return linear._replace(residual=linear.residual - columns @ values, H=H)
+        by_orientation = np.zeros((6, STATES))
+        by_orientation[:3, ORIENTATION] = np.eye(3)
+        by_orientation[3:, ORIENTATION] = cross_matrix(np.asarray(lever_arm, float))
+        return by_orientation[:, self.states]

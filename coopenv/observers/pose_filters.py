@@ -15,20 +15,10 @@ from numpy.typing import NDArray
 from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled, exp_so3, exp_translation, transformed
 from coopenv.estimation.poses import Array, cholesky, lengths, solve
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import InnovationGate, corrected_pose, iterated, look_from, turn_of_sight
-from coopenv.observers.frame import (
-    FRAME,
-    Frame,
-    LinearMeasurements,
-    UsableMeasurements,
-    across,
-    dense,
-    frame_of,
-    linearised,
-    normalised,
-    usable_measurements,
-)
+from coopenv.observers.correction import InnovationGate, iterated, look_from, turn_of_sight, updated
+from coopenv.observers.frame import CAMERA, FRAME, Frame, UsableMeasurements, usable_measurements
 from coopenv.observers.kernel_observer import KernelObserver
+from coopenv.observers.linearisation import LinearMeasurements, across, dense, linearised, normalised
 from coopenv.observers.p3p import solve_p3p
 from coopenv.observers.riccati import RICCATI
 from coopenv.observers.uncertain_pose import INVARIANT, LEFT, RIGHT, UncertainPose
@@ -98,48 +88,42 @@ class Mekf(PoseObserver):
     def take(self, tick: Tick, measured: UsableMeasurements) -> None:
         """Correct by the bearings that pass the gate."""
         if self.gated:
-            linear = self.linearised(tick, measured)
+            linear = self.linearised(measured)
             S = self.spread(measured, linear)
             kept = self.gate.passed(tick.time, linear, S)
             if not kept.all():
                 measured = measured.only(kept)
-        if len(measured.targets):
-            self.correct(tick, measured)
+        if len(measured.entries):
+            self.correct(measured)
 
-    def linearised(self, tick: Tick, measured: UsableMeasurements) -> LinearMeasurements:
+    def linearised(self, measured: UsableMeasurements) -> LinearMeasurements:
         """Return the measurements linearised at the estimate."""
-        return linearised(self.state, tick, measured)
+        return linearised(self.state, measured)
 
     def spread(self, measured: UsableMeasurements, linear: LinearMeasurements) -> Array:
         """Return (m, r, r) the covariances of the innovations."""
         return linear.spread(self.state.P)
 
-    def dof(self, tick: Tick, measured: UsableMeasurements) -> int:
-        """Return the number of rows that were measured."""
-        return 2 * len(measured.targets) if measured.others is None else linearised(self.state, tick, measured).dof
-
-    def correct(self, tick: Tick, measured: UsableMeasurements) -> None:
+    def correct(self, measured: UsableMeasurements) -> None:
         """Correct by measurements."""
-        self.nis_dof = self.dof(tick, measured)
-        self.nis = self.fuse(tick, measured)
+        self.nis, self.nis_dof = self.fuse(measured)
 
-    def correct_in_turn(self, tick: Tick, measured: UsableMeasurements, known: NDArray[np.bool_]) -> None:
+    def correct_in_turn(self, measured: UsableMeasurements, known: NDArray[np.bool_]) -> None:
         """Correct by the measurements of a mask (m,) at once, then by the others, of neighbours, one at a time."""
         if known.any():
-            first = measured.only(known)
-            self.nis_dof = self.dof(tick, first)
-            self.nis = self.fuse(tick, first)
+            self.nis, self.nis_dof = self.fuse(measured.only(known))
         for n in np.flatnonzero(~known).tolist():
-            self.fuse_neighbour(tick, measured.only(slice(n, n + 1)))
+            self.fuse_neighbour(measured.only(slice(n, n + 1)))
 
-    def fuse_neighbour(self, tick: Tick, one: UsableMeasurements) -> None:
-        """Correct by one bearing to a neighbour."""
-        self.fuse(tick, one)
+    def fuse_neighbour(self, one: UsableMeasurements) -> None:
+        """Correct by one measurement of a neighbour."""
+        self.fuse(one)
 
-    def fuse(self, tick: Tick, measured: UsableMeasurements) -> float:
-        """Correct by bearings; return their normalised innovation squared."""
-        self.state, nis = corrected_pose(self.state, tick, measured)
-        return nis
+    def fuse(self, measured: UsableMeasurements) -> tuple[float, int]:
+        """Correct by measurements; return their normalised innovation squared and their number of rows."""
+        *pose, nis, dof = updated(*self.state, measured.frame)
+        self.state = UncertainPose(self.kind, *pose)
+        return float(nis), dof
 
 
 class MekfCovariance(Mekf):
@@ -175,13 +159,13 @@ class RightInvariant(MekfCovariance):
 class IteratedEkf(MekfCovariance):
     """Error-state filter that iterates corrections; sends covariances."""
 
-    def fuse(self, tick: Tick, measured: UsableMeasurements) -> float:
-        """Correct by bearings, linearised anew until convergence; return their normalised innovation squared."""
+    def fuse(self, measured: UsableMeasurements) -> tuple[float, int]:
+        """Correct by measurements, linearised anew until convergence; return what `Mekf.fuse` returns."""
         before, distance = self.state, float(lengths(measured.positions - self.state.p).min())
-        look = look_from(before, tick, measured)
-        dx, P, nis = iterated(before.P, look, lambda dx: turn_of_sight(dx, distance))
+        look = look_from(before, measured)
+        dx, P, nis, dof = iterated(before.P, look, lambda dx: turn_of_sight(dx, distance))
         self.state = before.corrected(dx, P)
-        return nis
+        return nis, dof
 
 
 class HamelSamson(KernelObserver):
@@ -211,14 +195,14 @@ class Ukf(MekfCovariance):
     def take(self, tick: Tick, measured: UsableMeasurements) -> None:
         """Correct by the measurements that pass the gate."""
         P, xi = self.state.P, sigma_points(self.state.P)
-        linear = linearised(self.state, tick, measured)
-        if measured.others is None:
-            mean, S, y = unscented(self.state.R, self.state.p, xi, linear.N, frame_of(tick, measured))
+        linear = linearised(self.state, measured)
+        if len(measured.sensors) == 1:
+            mean, S, y = unscented(self.state.R, self.state.p, xi, linear.N, measured.frame)
         else:
-            mean, S, y = moments(self.deviations(xi, tick, measured, linear), linear)
+            mean, S, y = moments(self.deviations(xi, measured, linear), linear)
         r = linear.residual.ravel() - mean
         if self.gated:
-            each, rows = np.arange(len(measured.targets)), linear.residual.shape[1]
+            each, rows = np.arange(len(measured.entries)), linear.residual.shape[1]
             blocks = S.reshape(len(each), rows, len(each), rows)[each, :, each, :]
             fits = self.gate.passed(tick.time, linear._replace(residual=r.reshape(-1, rows)), blocks)
             kept, linear = fits.repeat(rows), linear.only(fits)
@@ -230,19 +214,20 @@ class Ukf(MekfCovariance):
         gain = solved[:, :-1].T
         P = P - gain.dot(S).dot(gain.T)
         self.state = self.state.moved(gain.dot(r), (P + P.T) / 2)
-        self.nis, self.nis_dof = float(r.dot(solved[:, -1])), linear.dof
+        self.nis, self.nis_dof = float(r.dot(solved[:, -1])), int(linear.used.sum())
 
-    def deviations(self, xi: Array, tick: Tick, measured: UsableMeasurements, linear: LinearMeasurements) -> Array:
+    def deviations(self, xi: Array, measured: UsableMeasurements, linear: LinearMeasurements) -> Array:
         """Return (k, rm) by how much predictions at sigma points xi (k, 6) exceed the one at the mean."""
-        at = [linearised(self.state.moved(x, self.state.P), tick, measured).residual for x in xi]
+        at = [linearised(self.state.moved(x, self.state.P), measured).residual for x in xi]
         return np.array([(linear.residual - residual).ravel() for residual in at])
 
 
 def moments(y: Array, linear: LinearMeasurements) -> tuple[Array, Array, Array]:
     """Return mean (n,) and covariance (n, n) of values (k, n) at the sigma points, and their deviations (k, n)."""
-    mean = WEIGHT * y.sum(axis=0)
+    mean, N, used = WEIGHT * y.sum(axis=0), np.eye(y.shape[1]), linear.used.ravel()
+    N[np.ix_(used, used)] = linear.stacked()[2]
     y = y - mean
-    return mean, linear.noise() + MEAN_WEIGHT * np.outer(mean, mean) + WEIGHT * y.T.dot(y), y
+    return mean, N + MEAN_WEIGHT * np.outer(mean, mean) + WEIGHT * y.T.dot(y), y
 
 
 def sigma_points(P: Array) -> Array:
@@ -267,7 +252,7 @@ def unscented(R: Array, p: Array, xi: Array, N: Array, frame: Frame) -> tuple[Ar
 
     The third is the deviation of each sigma point xi (k, 6), (k, 2m).
     """
-    lever_arm, _, positions, _, _ = frame
+    positions, lever_arm = frame[0].position, frame[1].position[CAMERA]
     m, k = len(positions), len(xi)
     y, mean = np.empty((k, 2 * m)), np.zeros(2 * m)
     for n in range(m):
@@ -331,15 +316,15 @@ class PerspectivePoints(PoseObserver):
         """Append the increment, and replace the pose by that of the frame where it has one."""
         self.state = self.state.predicted(tick)
         seen = usable_measurements(tick) if tick.due else None
-        if seen is not None and len((bearings := seen.of_camera()).targets) >= 3:
+        if seen is not None and len((bearings := seen.of_camera()).entries) >= 3:
             self.take(tick, bearings)
         return self.state.estimate()
 
     def take(self, tick: Tick, data: UsableMeasurements) -> None:
         """Take the pose of a frame if it is accepted."""
-        found = refined(self.state, tick, data)
+        found = refined(self.state, data)
         if found is None or distance(found, self.state) > POSE_GATE:
-            expected = (misfits(self.state, tick, data, self.state.P) < BEARING_GATE).all()
+            expected = (misfits(self.state, data, self.state.P) < BEARING_GATE).all()
             self.contradicted = 0.0 if expected else self.contradicted + tick.dt
             if expected and self.state.P[0, 0] + self.state.P[1, 1] + self.state.P[2, 2] < NARROW_STD**2:
                 return  # weak geometry at a plausible pose
@@ -354,31 +339,32 @@ class PerspectivePoints(PoseObserver):
         turns, cameras, mask = solve_p3p(data.bearings[triples], data.positions[triples])
         for R, camera in zip(turns[mask], cameras[mask], strict=True):
             start = UncertainPose(LEFT, R, camera - R @ tick.lever_arm, self.state.P)
-            agrees = misfits(start, tick, data) < BEARING_GATE
+            agrees = misfits(start, data) < BEARING_GATE
             if (count := int(agrees.sum())) < most:
                 continue
-            pose = refined(start, tick, data.only(agrees))
+            pose = refined(start, data.only(agrees))
             if pose is not None and (count > most or distance(pose, self.state) < nearest):
                 best, most, nearest = pose, count, distance(pose, self.state)
         return best
 
 
-def misfits(pose: UncertainPose, tick: Tick, data: UsableMeasurements, P: Array | None = None) -> Array:
+def misfits(pose: UncertainPose, data: UsableMeasurements, P: Array | None = None) -> Array:
     """Return (m,) the squared residuals over their variance, infinite for bearings from behind.
 
     With P, the variance is that given a pose with this covariance.
     """
-    residual, H, N, _, ahead, *_ = linearised(pose, tick, data)
+    linear = linearised(pose, data)
+    residual, H, N = linear[:3]
     if P is not None:
         N = N + H @ P @ H.transpose(0, 2, 1)
-    return np.where(ahead, normalised(residual, N), inf)
+    return np.where(linear.ahead, normalised(residual, N), inf)
 
 
-def refined(start: UncertainPose, tick: Tick, data: UsableMeasurements) -> UncertainPose | None:
+def refined(start: UncertainPose, data: UsableMeasurements) -> UncertainPose | None:
     """Return the least-squares pose near a start with its covariance, None where it fails, misfits or is too weak."""
     pose = start
     for _ in range(ITERATIONS):
-        residual, H, N, *_ = linearised(pose, tick, data)
+        residual, H, N, *_ = linearised(pose, data)
         determinants = N[:, 0, 0] * N[:, 1, 1] - N[:, 0, 1] * N[:, 0, 1]
         weighted = (N[:, ::-1, ::-1] * ADJUGATE / determinants[:, None, None] @ H).reshape(-1, 6)
         try:
@@ -393,7 +379,7 @@ def refined(start: UncertainPose, tick: Tick, data: UsableMeasurements) -> Uncer
             return None
         pose = pose.moved(step, (P + P.T) / 2)
         if step.dot(gradient) < CONVERGED:
-            ahead = linearised(pose, tick, data).ahead
+            ahead = linearised(pose, data).ahead
             fits = ahead & (normalised(residual - H @ step, N) < BEARING_GATE)
             return pose if fits.all() else None
     return None

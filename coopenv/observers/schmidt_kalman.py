@@ -19,19 +19,16 @@ broadcast, and the target of a bearing does not receive it: j is considered, and
 Sigma_ij is kept by i and propagated by j's factor.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coopenv.estimation.compiled import (
     MATRICES,
     MATRIX,
-    NUMBER,
     VECTOR,
-    WHOLE,
     adjoint,
     compiled,
     congruent,
@@ -41,13 +38,11 @@ from coopenv.estimation.compiled import (
 )
 from coopenv.estimation.poses import Array, cholesky
 from coopenv.observers.contract import Message, Setup, Tick
-from coopenv.observers.correction import PLACES, Look, Stacked, halfway, halfway_gain, joint_jacobian, joseph
-from coopenv.observers.frame import FRAME, Frame, LinearMeasurements, UsableMeasurements, frame_of, linearised
+from coopenv.observers.correction import CONSTANTS, NO_CONSTANTS, PLACES, Constants, halfway_gain, joseph
+from coopenv.observers.frame import FRAME, Frame, UsableMeasurements
+from coopenv.observers.linearisation import LinearMeasurements
 from coopenv.observers.pose_filters import Mekf
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, moved, recentring, transition
-
-Considered = tuple[Array, Array, Array, Array, Array, float]
-"""Results of `considered`."""
 
 MOST_LOST = 60  # lost messages in a row that a received factor may stand for
 SHRINKING = (0.98, 0.9, 0.7, 0.4, 0.0)
@@ -73,6 +68,11 @@ class ConsiderFilter(Mekf):
     def covariance(self) -> Array:
         """(n, n) covariance of the own error: that of the pose, and whatever else a subclass estimates behind it."""
         return self.state.P
+
+    @property
+    def constants(self) -> Constants:
+        """Constants of the camera that a subclass estimates."""
+        return NO_CONSTANTS
 
     def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
@@ -108,7 +108,7 @@ class ConsiderFilter(Mekf):
         self.factor = A.dot(self.factor)
 
     def take(self, tick: Tick, measured: UsableMeasurements) -> None:
-        """Receive the reports of the vehicles in view, then correct."""
+        """Receive the reports of the vehicles that are measured, then correct."""
         for target, message in zip(measured.targets.tolist(), measured.messages, strict=True):
             if message is not None:
                 self.receive(target, message)
@@ -120,9 +120,9 @@ class ConsiderFilter(Mekf):
         for n, target in enumerate(measured.targets.tolist()):
             if target in self.neighbours:
                 of = self.neighbours[target]
-                common = linear.H[n].dot(of.cross[:, 3:]).dot(linear.G[n].dot(of.R).T)
-                if linear.turn is not None:
-                    common += linear.H[n].dot(of.cross[:, :3]).dot(linear.turn[n].T)
+                by_target = linear.by_target[n]
+                common = linear.H[n].dot(of.cross[:, 3:]).dot(by_target[:, 3:].dot(of.R).T)
+                common += linear.H[n].dot(of.cross[:, :3]).dot(by_target[:, :3].T)
                 S[n] += common + common.T
         return S
 
@@ -142,8 +142,8 @@ class ConsiderFilter(Mekf):
         cross = bounded(cross, self.covariance, np.asarray(message.covariance, float))
         self.neighbours[target] = ConsideredNeighbour(now, message.rotation, message.covariance, cross)
 
-    def fuse(self, tick: Tick, measured: UsableMeasurements, between: Array | None = None) -> float:
-        """Correct by bearings to landmarks and to neighbours that are known; return the squared innovation.
+    def fuse(self, measured: UsableMeasurements, between: Array | None = None) -> tuple[float, int]:
+        """Correct by measurements of landmarks and of neighbours that are known; return what `Mekf.fuse` returns.
 
         `between` (n, n, 6, 6) holds the covariances of the neighbours with each other, in the order of `seen`.
         """
@@ -152,21 +152,18 @@ class ConsiderFilter(Mekf):
         joint = self.joint_covariance(of, between)
         places = np.array([seen.index(t) if t in self.neighbours else -1 for t in targets])
         turns = np.array([one.R for one in of], float).reshape(-1, 3, 3)
-        R, p, P, carried, crosses, nis = self.considered(tick, measured.exact(), joint, turns, places)
-        self.state = UncertainPose(LEFT, R, p, P)
+        frame = measured.exact().frame
+        made = considered(self.state.R, self.state.p, joint, frame, self.constants, turns, places)
+        R, p, P, change, carried, crosses, nis, dof = made
+        self.set_corrected(R, p, P, change)
         self.propagate_cross_covariances(carried, [t for t in self.neighbours if t not in seen])
         for target, was, cross in zip(seen, of, crosses, strict=True):
             self.neighbours[target] = ConsideredNeighbour(was.number, was.R, was.P, cross)
-        return float(nis)
+        return float(nis), dof
 
-    def considered(
-        self, tick: Tick, measured: UsableMeasurements, joint: Array, turns: Array, places: NDArray[np.int64]
-    ) -> Considered:
-        """Return the correction by measurements of targets without covariances; arguments as for `considered`."""
-        if measured.others is None:
-            return considered(self.state.R, self.state.p, joint, frame_of(tick, measured), turns, places)
-        look = look_with_neighbours(self.state, tick, measured, turns, places)
-        return considered_from(self.state.R, self.state.p, 6, joint, *halfway(joint, look))
+    def set_corrected(self, R: Array, p: Array, P: Array, change: Array) -> None:
+        """Set the corrected pose, the covariance (n, n) of the own error, and the change of the constants (n - 6,)."""
+        self.state = UncertainPose(LEFT, R, p, P)
 
     def seen(self, measured: UsableMeasurements) -> list[int]:
         """Return the known neighbours among the targets, each once."""
@@ -193,51 +190,27 @@ class ConsiderFilter(Mekf):
         return shrunk
 
 
-def look_with_neighbours(
-    state: UncertainPose,
-    tick: Tick,
-    measured: UsableMeasurements,
-    turns: Array,
-    places: NDArray[np.int64],
-    by_constants: Callable[[LinearMeasurements, Array], LinearMeasurements] | None = None,
-) -> Look:
-    """Return measurements as a function of the own errors (n + 6k,) and of those of the poses of k neighbours.
+@compiled(MATRIX, VECTOR, MATRIX, FRAME, CONSTANTS, MATRICES, PLACES)
+def considered(
+    R: Array, p: Array, joint: Array, frame: Frame, constants: Constants, turns: Array, places: Any
+) -> tuple[Array, Array, Array, Array, Array, Array, float, int]:
+    """Correct the own error, linearised half way (correction.py); neighbours are considered (Schmidt).
 
     Args:
-        state: the own pose as predicted.
-        tick: the frame.
-        measured: its measurements, of targets without covariances.
+        R: (3, 3) the own orientation.
+        p: (3,) the own position.
+        joint: (n + 6k, n + 6k) covariance of the own error and those of k neighbours.
+        frame: the measurements; targets have no covariances.
+        constants: of the camera, n - 6 of them.
         turns: (k, 3, 3) the neighbours' orientations.
         places: (m,) the neighbour of each measurement, -1: none.
-        by_constants: adds the derivative by constants behind the own pose, whose errors (n - 6,) it gets; None: n = 6.
+
+    Returns:
+        Orientation, position, covariance (n, n), change of the constants (n - 6,), the factor (n, n) of the other
+        cross-covariances, those with the neighbours (k, n, 6), r^T S^-1 r at the prediction, and the number of rows.
     """
-
-    def look(at: Array) -> Stacked:
-        linear = linearised(state.moved(at[:6], state.P), tick, measured)
-        if by_constants is not None:
-            linear = by_constants(linear, at)
-        own = linear.H.shape[-1]
-        recentred = np.eye(own)
-        recentred[:6, :6] = recentring(LEFT, at[:6])
-        whole = joint_jacobian(linear.H, linear.G, recentred, turns, places)
-        blocks = whole.reshape(*linear.residual.shape, -1)
-        for n, turn in enumerate(() if linear.turn is None else linear.turn):
-            if (k := places[n]) >= 0:
-                blocks[n, :, own + 6 * k : own + 6 * k + 3] += turn
-        return linear.residual.ravel(), whole, linear.noise()
-
-    return look
-
-
-@compiled(MATRIX, VECTOR, WHOLE, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, NUMBER)
-def considered_from(
-    R: Array, p: Array, own: int, joint: Array, K: Array, whole: Array, N: Array, dx: Array, nis: float
-) -> Considered:
-    """Return the results of `considered` from a gain K (n, k), derivatives (k, n), noise N (k, k) and dx (n,).
-
-    The first `own` errors are corrected: those of the pose and, behind them, constants, whose errors add up.
-    """
-    K = K.copy()
+    K, whole, N, dx, nis = halfway_gain(LEFT, R, p, joint, frame, constants, turns, places)
+    own = 6 + len(constants[1])
     K[own:] = 0.0
     after = joseph(joint, K, whole, N)
     R, p = moved(LEFT, R, p, dx[:6])
@@ -245,30 +218,10 @@ def considered_from(
     place(recentred, 0, 0, recentring(LEFT, dx[:6]))
     P = congruent(recentred, after[:own, :own])
     carried = eliminated(joint[:own, :own], product(after[:own, :own], recentred.T)).T
-    crosses = np.empty(((len(joint) - own) // 6, own, 6))
-    for n in range(len(crosses)):
+    crosses = np.empty((len(turns), own, 6))
+    for n in range(len(turns)):
         place(crosses[n], 0, 0, product(recentred, after[:own, own + 6 * n : own + 6 * n + 6]))
-    return R, p, P, carried, crosses, nis
-
-
-@compiled(MATRIX, VECTOR, MATRIX, FRAME, MATRICES, PLACES)
-def considered(R: Array, p: Array, joint: Array, frame: Frame, turns: Array, places: Any) -> Considered:
-    """Correct the own pose by bearings, linearised half way (correction.py); neighbours are considered (Schmidt).
-
-    Args:
-        R: (3, 3) the own orientation.
-        p: (3,) the own position.
-        joint: (6 + 6k, 6 + 6k) covariance of the own error and those of k neighbours.
-        frame: the bearings; points have no covariances.
-        turns: (k, 3, 3) the neighbours' orientations.
-        places: (m,) the neighbour of each bearing, -1: none.
-
-    Returns:
-        Orientation, position, covariance (6, 6), the factor (6, 6) of the other cross-covariances, those with the
-        neighbours (k, 6, 6), and r^T S^-1 r at the prediction.
-    """
-    K, whole, N, dx, nis = halfway_gain(LEFT, R, p, joint, frame, turns, places)
-    return considered_from(R, p, 6, joint, K, whole, N, dx, nis)
+    return R, p, P, dx[6:own], carried, crosses, nis, len(N)
 
 
 @compiled(MATRIX, MATRIX, MATRIX)
@@ -305,16 +258,15 @@ class SchmidtKalman(ConsiderFilter):
         extra: dict[str, Array] = {**report.extra, "targets": np.array(targets, float), "cross": cross}
         return Message(report.position, report.rotation, report.covariance, extra)
 
-    def correct(self, tick: Tick, measured: UsableMeasurements) -> None:
-        """Correct by all bearings at once."""
+    def correct(self, measured: UsableMeasurements) -> None:
+        """Correct by all measurements at once."""
         messages = dict(zip(measured.targets.tolist(), measured.messages, strict=True))
         seen = [(target, messages[target]) for target in self.seen(measured)]
         between = np.zeros((len(seen), len(seen), 6, 6))
         for n, (target, message) in enumerate(seen):
             for m, (other, its) in enumerate(seen[:n]):
                 between[n, m] = sent_cross_covariance(message, other) + sent_cross_covariance(its, target).T
-        self.nis_dof = self.dof(tick, measured)
-        self.nis = self.fuse(tick, measured, between)
+        self.nis, self.nis_dof = self.fuse(measured, between)
 
 
 def sent_cross_covariance(message: Message, target: int) -> Array:
@@ -332,7 +284,7 @@ class Pairwise(ConsiderFilter):
     It sends its pose with covariance and its factor. The normalised innovation is that of the landmarks.
     """
 
-    def correct(self, tick: Tick, measured: UsableMeasurements) -> None:
+    def correct(self, measured: UsableMeasurements) -> None:
         """Correct by the landmarks, then by neighbours one at a time."""
         known = np.array([target not in self.neighbours for target in measured.targets.tolist()])
-        self.correct_in_turn(tick, measured, known)
+        self.correct_in_turn(measured, known)

@@ -6,14 +6,14 @@ with the lasting errors of this vehicle are neglected.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Setup, Tick
-from coopenv.observers.correction import halfway
-from coopenv.observers.frame import LinearMeasurements, UsableMeasurements
+from coopenv.observers.correction import Constants, with_constants
+from coopenv.observers.frame import UsableMeasurements
 from coopenv.observers.lasting_errors import LastingErrors
-from coopenv.observers.schmidt_kalman import Considered, SchmidtKalman, considered_from, look_with_neighbours
+from coopenv.observers.linearisation import LinearMeasurements
+from coopenv.observers.schmidt_kalman import SchmidtKalman
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose, predicted, transition
 
 
@@ -26,6 +26,7 @@ class SelfCalibrating(SchmidtKalman):
     def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
         self.lasting = LastingErrors(setup.noise)
+        self.by_pose = self.lasting.by_pose(setup.lever_arm)
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose, with lasting errors of zero."""
@@ -52,22 +53,17 @@ class SelfCalibrating(SchmidtKalman):
         R, p, _ = predicted(LEFT, self.state.R, self.state.p, self.state.P, step.rotation, step.translation, noise)
         self.state = UncertainPose(LEFT, R, p, self.P[:6, :6])
 
-    def linearised(self, tick: Tick, measured: UsableMeasurements) -> LinearMeasurements:
+    @property
+    def constants(self) -> Constants:
+        """The lasting errors, of which those of the camera's orientation move bearings."""
+        return self.by_pose, self.values
+
+    def linearised(self, measured: UsableMeasurements) -> LinearMeasurements:
         """Return the measurements linearised at the estimate, also by the lasting errors."""
-        return self.lasting.on_bearings(super().linearised(tick, measured), tick, measured, self.values)
+        linear = super().linearised(measured)
+        residual, H = with_constants(linear.residual, linear.H, linear.entries, self.constants)
+        return linear._replace(residual=residual, H=H)
 
-    def considered(
-        self, tick: Tick, measured: UsableMeasurements, joint: Array, turns: Array, places: NDArray[np.int64]
-    ) -> Considered:
-        """Return the correction of the pose, and correct the lasting errors."""
-
-        def by_constants(linear: LinearMeasurements, at: Array) -> LinearMeasurements:
-            return self.lasting.on_bearings(linear, tick, measured, self.values + at[6 : len(self.P)])
-
-        look = look_with_neighbours(self.state, tick, measured, turns, places, by_constants)
-        K, whole, N, dx, nis = halfway(joint, look, len(self.P))
-        size = len(self.P)
-        made = considered_from(self.state.R, self.state.p, size, joint, K, whole, N, dx, nis)
-        R, p, self.P, carried, crosses, nis = made
-        self.values = self.values + dx[6:size]
-        return R, p, self.P[:6, :6], carried, crosses, nis
+    def set_corrected(self, R: Array, p: Array, P: Array, change: Array) -> None:
+        """Set the corrected pose and lasting errors."""
+        self.state, self.P, self.values = UncertainPose(LEFT, R, p, P[:6, :6]), P, self.values + change

@@ -1,0 +1,359 @@
+"""Measurements of any kind, linearised at a pose by compiled functions.
+
+Each kind has rows. A row depends on the place of the target in the body frame by a vector j: its derivative is (j x a,
+-j) by a left error, with a the point about which the body turns it, and g = R j by the target in map axes. A row may
+also depend on turns. What was not measured, or needs what is not known of a target, has residual 0, derivative 0 and
+noise 1, and so counts nothing.
+
+A kind of a user has functions in NumPy, which compiled functions call.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import objmode, types
+from numpy.typing import NDArray
+
+from coopenv.estimation.compiled import (
+    FLAG,
+    MATRICES,
+    MATRIX,
+    NUMBER,
+    ROW,
+    TARGET,
+    VECTOR,
+    WHOLE,
+    adjoint,
+    compiled,
+    congruent,
+    eliminated,
+    exp_so3,
+    logarithm,
+    place,
+    product,
+    transformed,
+)
+from coopenv.estimation.poses import Array
+from coopenv.measurements.kinds import Placed
+from coopenv.observers.frame import (
+    ATTITUDE,
+    BEARING,
+    ENTRY,
+    FRAME,
+    OWN_KIND,
+    POSITION,
+    RANGE,
+    RECORDS,
+    RELATIVE_POSE,
+    Frame,
+    UsableMeasurements,
+    ticks_of_own_kinds,
+)
+from coopenv.observers.uncertain_pose import RIGHT, UncertainPose
+
+BLOCKS = types.Array(types.float64, 3, "C")
+FLAGS, FLAG_ROWS = (types.Array(types.boolean, n, "A", readonly=True) for n in (1, 2))
+
+
+class LinearMeasurements(NamedTuple):
+    """Linearised measurements, m of them, each with r rows, of which some were measured."""
+
+    residual: Array  # (m, r); of bearings rad, in the tangent planes
+    H: Array  # (m, r, n) derivative of the measurement by the error
+    N: Array  # (m, r, r) covariance of the residuals given the own pose
+    by_target: Array  # (m, r, 6) by a turn of the target about its own axes, and by its position in map axes
+    variance: Array  # (m, r) of the sensors alone
+    used: NDArray[np.bool_]  # (m, r) rows that were measured
+    angle: NDArray[np.bool_]  # (m, r) rows among them that measure an angle
+    ahead: NDArray[np.bool_]  # (m,) whether the points are ahead along the bearings, and not behind
+    entries: NDArray[Any]  # (m,) `ENTRY`
+
+    def only(self, kept: NDArray[np.bool_]) -> "LinearMeasurements":
+        """Return the measurements of a mask (m,)."""
+        return LinearMeasurements._make(part[kept] for part in self)
+
+    def spread(self, P: Array) -> Array:
+        """Return (m, r, r) the covariances of the innovations, given that of the error (n, n)."""
+        return spread(self.H, P, self.N)
+
+    def stacked(self) -> tuple[Array, Array, Array]:
+        """Return residual (k,), H (k, n) and N (k, k) of the rows that were measured."""
+        residual, H, N = stacked(self.residual, self.H, self.N, self.by_target, self.used, self.entries)
+        return residual, H, N
+
+
+def linearised(pose: UncertainPose, measured: UsableMeasurements) -> LinearMeasurements:
+    """Linearise measurements at a pose; the points' covariances are noise, as if independent of the pose."""
+    return LinearMeasurements(*linearise(pose.R, pose.p, pose.kind == RIGHT, measured.frame), measured.entries)
+
+
+@compiled(NUMBER, NUMBER, NUMBER)
+def across(x: float, y: float, z: float) -> Array:
+    """Return (2, 3) orthonormal rows across a unit vector.
+
+    Source: Duff et al., Building an orthonormal basis, revisited, Journal of Computer Graphics Techniques 6(1), 2017.
+    """
+    sign = math.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    c = x * y * a
+    return np.array([[1.0 + sign * x * x * a, sign * c, -sign * x], [c, sign + y * y * a, -y]])
+
+
+@compiled(ROW, VECTOR, VECTOR, NUMBER)
+def put_derivative(row: Array, u: Array, about: Array, factor: float) -> None:
+    """Write (u x about, -u) times a factor into a row (6,)."""
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        row[k] = (u[i] * about[j] - u[j] * about[i]) * factor
+        row[k + 3] = -u[k] * factor
+
+
+@compiled(WHOLE, VECTOR, VECTOR, MATRIX, ROW, TARGET)
+def put_sight(kind: int, value: Array, d: Array, M: Array, residual: Array, J: Array) -> bool:
+    """Write the rows of direction and distance of a target at d (3,); return whether it is ahead along the value.
+
+    Args:
+        kind: BEARING, RANGE or RANGE_BEARING.
+        value: as measured.
+        d: from the sensor to the target, the sensor's axes, m.
+        M: (3, 3) sensor to body.
+        residual: (6,) its rows.
+        J: (6, 3) derivatives by the place of the target in the body frame.
+    """
+    distance, row = max(math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), 1e-9), 0
+    if kind != RANGE:
+        B = across(d[0] / distance, d[1] / distance, d[2] / distance)
+        for k in range(2):
+            residual[k] = B[k, 0] * value[0] + B[k, 1] * value[1] + B[k, 2] * value[2]
+            for i in range(3):
+                J[k, i] = (M[i, 0] * B[k, 0] + M[i, 1] * B[k, 1] + M[i, 2] * B[k, 2]) / distance
+        row = 2
+    if kind != BEARING:
+        residual[row] = value[0 if kind == RANGE else 3] - distance
+        for i in range(3):
+            J[row, i] = (M[i, 0] * d[0] + M[i, 1] * d[1] + M[i, 2] * d[2]) / distance
+    return kind == RANGE or d[0] * value[0] + d[1] * value[1] + d[2] * value[2] > 0.0
+
+
+@compiled(VECTOR, MATRIX, ROW)
+def put_turn(value: Array, predicted: Array, residual: Array) -> None:
+    """Write the turn (3,), rad, from a predicted orientation (3, 3) to a measured rotation vector."""
+    turn = logarithm(product(exp_so3(value), predicted.T))
+    for k in range(3):
+        residual[k] = turn[k]
+
+
+@compiled(WHOLE, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, ROW, TARGET, TARGET, TARGET)
+def put_rows(
+    kind: int,
+    value: Array,
+    z: Array,
+    d: Array,
+    R: Array,
+    M: Array,
+    target_R: Array,
+    residual: Array,
+    J: Array,
+    by_turn: Array,
+    by_its_turn: Array,
+) -> bool:
+    """Write the rows of one measurement; return whether its target is ahead of the sensor.
+
+    Args:
+        kind: a compiled one.
+        value: as measured.
+        z: place of the target, or of a sensor that measures the map, in map axes, m.
+        d: from the sensor to the target, the sensor's axes, m.
+        R: (3, 3) body to map.
+        M: (3, 3) sensor to body.
+        target_R: (3, 3) target to map.
+        residual: (6,) its rows.
+        J: (6, 3) derivatives by the place z in body axes.
+        by_turn: (6, 3) derivatives by a turn of the body about its axes.
+        by_its_turn: (6, 3) derivatives by a turn of the target about its axes.
+    """
+    if kind == POSITION:
+        for k in range(3):
+            residual[k] = value[k] - z[k]
+            for i in range(3):
+                J[k, i] = -R[k, i]
+    elif kind == ATTITUDE:
+        put_turn(value[:3], product(R, M), residual[:3])
+        place(by_turn, 0, 0, R)
+    elif kind == RELATIVE_POSE:
+        for k in range(3):
+            residual[k] = value[k] - d[k]
+        turned = product(product(R, M).T, target_R)
+        put_turn(value[3:], turned, residual[3:])
+        place(J, 0, 0, M.T)
+        place(by_turn, 3, 0, -M.T)
+        place(by_its_turn, 3, 0, turned)
+    else:
+        return put_sight(kind, value, d, M, residual, J)
+    return True
+
+
+@compiled(TARGET, BLOCKS, BLOCKS, TARGET, types.Array(types.boolean, 2, "C"), FRAME)
+def completed(
+    residual: Array, H: Array, by_target: Array, variance: Array, used: NDArray[np.bool_], frame: Frame
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Clear rows that are not finite, and return N and `angle` of `LinearMeasurements`."""
+    entries, sensors, _ = frame
+    (m, r), angle = residual.shape, np.zeros(residual.shape, np.bool_)
+    N = np.zeros((m, r, r))
+    for n in range(m):
+        for k in range(r):
+            if not math.isfinite(residual[n, k] + np.sum(H[n, k]) + np.sum(by_target[n, k])):
+                residual[n, k], variance[n, k], used[n, k] = 0.0, 1.0, False
+                for i in range(6):
+                    H[n, k, i] = by_target[n, k, i] = 0.0
+            angle[n, k] = used[n, k] and sensors.angle[entries.sensor[n], k] == 1
+        if np.trace(entries.covariance[n]) > 0.0:
+            place(N[n], 0, 0, congruent(by_target[n], entries.covariance[n]))
+        for k in range(r):
+            N[n, k, k] += variance[n, k]
+    return N, angle
+
+
+@compiled(MATRIX, VECTOR, FLAG, FRAME)
+def linearise(
+    R: Array, p: Array, right: bool, frame: Frame
+) -> tuple[Array, Array, Array, Array, Array, NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the first fields of `LinearMeasurements`; `right`: the error is about the map's axes."""
+    entries, sensors, own = frame
+    m, r = len(entries), np.max(sensors.rows)
+    residual, H, by_target, variance = np.zeros((m, r)), np.zeros((m, r, 6)), np.zeros((m, r, 6)), np.ones((m, r))
+    used, ahead = np.zeros((m, r), np.bool_), np.ones(m, np.bool_)
+    for n in range(m):
+        s, target = entries.sensor[n], entries.target[n]
+        kind, lever_arm, M = sensors.kind[s], sensors.position[s], sensors.rotation[s]
+        if kind == OWN_KIND:
+            continue
+        z = entries.position[n] if target >= 0 else p + transformed(R, lever_arm)
+        a = transformed(R.T, z - p)
+        d = transformed(M.T, a - lever_arm)
+        rows, J, by_turn, by_its_turn = np.zeros(6), np.zeros((6, 3)), np.zeros((6, 3)), np.zeros((6, 3))
+        value, its_R = entries.value[n], entries.rotation[n]
+        ahead[n] = put_rows(kind, value, z, d, R, M, its_R, rows, J, by_turn, by_its_turn)
+        by_distance = sensors.variance_by_distance[s] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+        for k in range(sensors.rows[s]):
+            g, turn = transformed(R, J[k]), by_turn[k]
+            if right:
+                put_derivative(H[n, k], g, z, 1.0)
+                turn = transformed(R, turn)
+            else:
+                put_derivative(H[n, k], J[k], a, 1.0)
+            residual[n, k], variance[n, k], used[n, k] = rows[k], sensors.variance[s, k] + by_distance, True
+            for i in range(3):
+                H[n, k, i] += turn[i]
+                if target >= 0:
+                    by_target[n, k, i], by_target[n, k, i + 3] = by_its_turn[k, i], g[i]
+    if own != 0:
+        with objmode():
+            put_own_kinds(R, p, right, frame, residual, H, by_target, variance, used)
+    N, angle = completed(residual, H, by_target, variance, used, frame)
+    return residual, H, N, by_target, variance, used, angle, ahead
+
+
+def put_own_kinds(
+    R: Array,
+    p: Array,
+    right: bool,
+    frame: Frame,
+    residual: Array,
+    H: Array,
+    by_target: Array,
+    variance: Array,
+    used: NDArray[np.bool_],
+) -> None:
+    """Write the measurements of kinds that are not compiled; arguments as for `LinearMeasurements`."""
+    (entries, sensors, own), to_error = frame, np.linalg.inv(adjoint(R, p)) if right else np.eye(6)
+    tick = ticks_of_own_kinds[own]
+    for number in np.flatnonzero(sensors["kind"] == OWN_KIND):
+        sensor = tick.readings[number - 1].sensor
+        of = np.flatnonzero(entries["sensor"] == number)
+        if not len(of):
+            continue
+        its = entries[of]
+        place_of_own = sensor.placed(R, p, tick.velocity, tick.angular_velocity, tick.landmarks_by_name)
+        target = Placed(its["position"], its["rotation"], its["velocity"], np.zeros_like(its["velocity"]))
+        found = sensor.linearised(R, place_of_own.repeated(len(of)), target, its["value"][:, : sensor.kind.size])
+        rows = slice(0, sensor.kind.rows)
+        residual[of, rows], variance[of, rows], used[of, rows] = found.residual, found.noise, found.used
+        H[of, rows], by_target[of, rows] = found.by_own @ to_error, found.by_target
+
+
+@compiled(MATRIX, MATRICES, MATRICES, MATRICES, FLAG_ROWS, RECORDS[ENTRY])
+def stacked(
+    residual: Array, H: Array, N: Array, by_target: Array, used: NDArray[np.bool_], entries: NDArray[Any]
+) -> tuple[Array, Array, Array]:
+    """Return residual (k,), H (k, n) and N (k, k) of the rows that were measured, with H (m, r, n).
+
+    Two measurements of one uncertain target have correlated residuals.
+    """
+    (m, r), k = used.shape, np.count_nonzero(used)
+    stacked_residual, stacked_H, stacked_N = np.empty(k), np.empty((k, H.shape[2])), np.zeros((k, k))
+    first = np.zeros(m + 1, np.int64)
+    at = np.empty((k, 2), np.int64)
+    row = 0
+    for n in range(m):
+        for i in range(r):
+            if used[n, i]:
+                at[row, 0], at[row, 1] = n, i
+                row += 1
+        first[n + 1] = row
+    for a in range(k):
+        n, i = at[a]
+        stacked_residual[a] = residual[n, i]
+        for j in range(H.shape[2]):
+            stacked_H[a, j] = H[n, i, j]
+        for b in range(first[n], first[n + 1]):
+            stacked_N[a, b] = N[n, i, at[b, 1]]
+    for n in range(m):
+        C, target = entries.covariance[n], entries.target[n]
+        for l in range(n):  # noqa: E741
+            if entries.target[l] == target and target >= 0 and np.trace(C) > 0.0:
+                both = product(product(by_target[n], C), by_target[l].T)
+                for a in range(first[n], first[n + 1]):
+                    for b in range(first[l], first[l + 1]):
+                        stacked_N[a, b] = stacked_N[b, a] = both[at[a, 1], at[b, 1]]
+    return stacked_residual, stacked_H, stacked_N
+
+
+@compiled(MATRIX, MATRICES)
+def normalised(residual: Array, S: Array) -> Array:
+    """Return (m,) r^T S^-1 r of residuals (m, r)."""
+    result = np.zeros(len(residual))
+    for n in range(len(residual)):
+        if residual.shape[1] == 2:
+            x, y = residual[n]
+            a, b, d = S[n, 0, 0], S[n, 0, 1], S[n, 1, 1]
+            result[n] = (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
+        else:
+            solved = eliminated(S[n], residual[n].copy().reshape(-1, 1))
+            for k in range(residual.shape[1]):
+                result[n] += residual[n, k] * solved[k, 0]
+    return result
+
+
+@compiled(MATRICES)
+def dense(blocks: Array) -> Array:
+    """Return (rm, rm) the block diagonal of blocks (m, r, r)."""
+    r = blocks.shape[1]
+    N = np.zeros((r * len(blocks), r * len(blocks)))
+    for n in range(len(blocks)):
+        place(N, r * n, r * n, blocks[n])
+    return N
+
+
+@compiled(MATRICES, MATRIX, MATRICES)
+def spread(H: Array, P: Array, N: Array) -> Array:
+    """Return (m, r, r) H P H^T + N of every measurement."""
+    S, r = N.copy(), N.shape[1]
+    for n in range(len(H)):
+        HPH = congruent(H[n], P)
+        for i in range(r):
+            for j in range(r):
+                S[n, i, j] += HPH[i, j]
+    return S
