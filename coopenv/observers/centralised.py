@@ -35,6 +35,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import block_diag
 
+from coopenv.estimation.compiled import adjoint
 from coopenv.estimation.poses import Array, exp_so3, orthonormalise, skew
 from coopenv.observers import uncertain_pose
 from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick
@@ -57,6 +58,7 @@ class Centralised:
         """Take the setups of all."""
         self.landmarks = setups[0].landmarks
         self.markers = [setup.marker for setup in setups]
+        self.to_marker = [adjoint(np.eye(3), -marker) for marker in self.markers]  # own left error to the marker's
         self.moves = any("velocity" in sensor.kind.needs for setup in setups for sensor in setup.sensors)
 
     def reset(self, initial_poses: Sequence[tuple[Array, Array]], initial_covariances: Sequence[Array]) -> None:
@@ -136,9 +138,7 @@ class Centralised:
         H[:, :, self.block(i)] = own.H
         for n, target in enumerate(measured.targets.tolist()):
             if (j := target - self.landmarks) >= 0:
-                G = own.by_target[n, :, 3:].dot(self.poses[j][0])
-                turn = own.by_target[n, :, :3] + G.dot(skew(-self.markers[j]))
-                H[n, :, self.block(j)] = np.concatenate([turn, G], axis=1)
+                H[n, :, self.block(j)] = own.by_target[n].dot(self.to_marker[j])
         return own._replace(H=H)
 
     @staticmethod

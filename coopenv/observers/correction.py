@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from coopenv.estimation.compiled import (
     MATRICES,
     MATRIX,
+    TARGET,
     VECTOR,
     WHOLE,
     compiled,
@@ -40,7 +41,7 @@ from coopenv.estimation.compiled import (
     transformed,
 )
 from coopenv.estimation.poses import Array, solve
-from coopenv.observers.frame import CAMERA, ENTRY, FRAME, RECORDS, Frame, UsableMeasurements
+from coopenv.observers.frame import CAMERA, FRAME, Frame, UsableMeasurements
 from coopenv.observers.linearisation import (
     FLAG_ROWS,
     FLAGS,
@@ -89,10 +90,10 @@ def joseph(P: Array, K: Array, H: Array, N: Array) -> Array:
 
 def look_from(state: UncertainPose, measured: UsableMeasurements) -> Look:
     """Return measurements as a function of the own error about a predicted pose."""
-    turns, places = np.zeros((0, 3, 3)), np.full(len(measured.entries), -1)
+    places = np.full(len(measured.entries), -1)
 
     def look(at: Array) -> Stacked:
-        seen: Stacked = looked(state.kind, state.R, state.p, at, measured.frame, NO_CONSTANTS, turns, places)
+        seen: Stacked = looked(state.kind, state.R, state.p, at, measured.frame, NO_CONSTANTS, places)
         return seen
 
     return look
@@ -201,67 +202,65 @@ of the constants does, and their values (c,)."""
 NO_CONSTANTS = np.zeros((6, 0)), np.zeros(0)
 
 
-@compiled(MATRIX, MATRICES, RECORDS[ENTRY], CONSTANTS)
-def with_constants(residual: Array, H: Array, entries: NDArray[Any], constants: Constants) -> tuple[Array, Array]:
-    """Return residuals (m, r) less what constants explain, and H (m, r, 6 + c)."""
-    by_pose, values = constants
-    (m, r, _), c = H.shape, len(values)
-    if c == 0:
-        return residual, H
-    residual, whole = residual.copy(), np.zeros((m, r, 6 + c))
+@compiled(TARGET, MATRICES, MATRICES, FRAME, MATRIX, CONSTANTS, PLACES, WHOLE)
+def joint_jacobian(
+    residual: Array,
+    H: Array,
+    by_target: Array,
+    frame: Frame,
+    recentring: Array,
+    constants: Constants,
+    places: Any,
+    neighbours: int,
+) -> Array:
+    """Return (m, r, 6 + c + 6k) the derivative by the errors of the own pose, c constants, and k neighbours.
+
+    Args:
+        residual: (m, r), from which what constants explain is subtracted.
+        H: (m, r, 6) by the error about where it is linearised.
+        by_target: (m, r, 6) as in `LinearMeasurements`.
+        frame: the measurements.
+        recentring: (6, 6) of the error of the own pose.
+        constants: of the camera.
+        places: (m,) the neighbour of each measurement, -1: none.
+        neighbours: k.
+    """
+    (m, r, _), (by_pose, values) = H.shape, constants
+    own = 6 + len(values)
+    whole = np.zeros((m, r, own + 6 * neighbours))
     for n in range(m):
-        place(whole[n], 0, 0, H[n])
-        if entries.sensor[n] == CAMERA:
+        place(whole[n], 0, 0, product(H[n], recentring))
+        if own > 6 and frame[0].sensor[n] == CAMERA:
             columns = product(H[n], by_pose)
             place(whole[n], 0, 6, columns)
             explained = transformed(columns, values)
             for k in range(r):
                 residual[n, k] -= explained[k]
-    return residual, whole
-
-
-@compiled(MATRICES, MATRICES, MATRIX, MATRICES, PLACES)
-def joint_jacobian(H: Array, by_target: Array, recentring: Array, turns: Array, places: Any) -> Array:
-    """Return (m, r, n + 6k) the derivative of m measurements by the own error and those of k neighbours.
-
-    Args:
-        H: (m, r, n) by the error about where it is linearised.
-        by_target: (m, r, 6) as in `LinearMeasurements`.
-        recentring: (6, 6) of the error of the own pose.
-        turns: (k, 3, 3) the neighbours' orientations.
-        places: (m,) the neighbour of each measurement, -1: none.
-    """
-    m, r, own = H.shape
-    whole = np.zeros((m, r, own + 6 * len(turns)))
-    for n in range(m):
-        place(whole[n], 0, 0, H[n])
-        place(whole[n], 0, 0, product(H[n, :, :6], recentring))
-        k = places[n]
-        if k >= 0:
-            place(whole[n], 0, own + 6 * k, by_target[n, :, :3])
-            place(whole[n], 0, own + 6 * k + 3, product(by_target[n, :, 3:], turns[k]))
+        if places[n] >= 0:
+            place(whole[n], 0, own + 6 * places[n], by_target[n])
     return whole
 
 
-@compiled(WHOLE, MATRIX, VECTOR, VECTOR, FRAME, CONSTANTS, MATRICES, PLACES)
-def looked(
-    kind: int, R: Array, p: Array, at: Array, frame: Frame, constants: Constants, turns: Array, places: Any
-) -> Stacked:
+@compiled(WHOLE, MATRIX, VECTOR, VECTOR, FRAME, CONSTANTS, PLACES)
+def looked(kind: int, R: Array, p: Array, at: Array, frame: Frame, constants: Constants, places: Any) -> Stacked:
     """Return residual (k,), H (k, n) and N (k, k), linearised at a predicted pose that is moved by errors (n,).
 
     The poses of neighbours stay as they are. Arguments are those of `halfway_gain`.
     """
+    by_pose, values = constants
+    own = 6 + len(values)
     R, p = moved(kind, R, p, at[:6])
     residual, H, N, by_target, _, used, _, _ = linearise(R, p, kind == RIGHT, frame)
-    by_pose, values = constants
-    residual, H = with_constants(residual, H, frame[0], (by_pose, values + at[6 : 6 + len(values)]))
-    whole = joint_jacobian(H, by_target, recentring(kind, at[:6]), turns, places)
-    return stacked(residual, whole, N, by_target, used, frame[0])
+    moved_constants = by_pose, values + at[6:own]
+    neighbours = (len(at) - own) // 6
+    recentred = recentring(kind, at[:6])
+    whole = joint_jacobian(residual, H, by_target, frame, recentred, moved_constants, places, neighbours)
+    return stacked(residual, whole, N, by_target, used, frame)
 
 
-@compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME, CONSTANTS, MATRICES, PLACES)
+@compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME, CONSTANTS, PLACES)
 def halfway_gain(
-    kind: int, R: Array, p: Array, P: Array, frame: Frame, constants: Constants, turns: Array, places: Any
+    kind: int, R: Array, p: Array, P: Array, frame: Frame, constants: Constants, places: Any
 ) -> tuple[Array, Array, Array, Array, float]:
     """Return (K (n, k), H, N, dx (n,), r^T S^-1 r at the prediction) of the correction of a prediction.
 
@@ -271,18 +270,17 @@ def halfway_gain(
         kind: of the own error.
         R: (3, 3) the own orientation.
         p: (3,) the own position.
-        P: (n, n) covariance of the own error, of c constants, and of the errors of some neighbours.
+        P: (n, n) covariance of the own error, of constants, and of the errors of some neighbours.
         frame: the measurements.
         constants: of the camera.
-        turns: see `joint_jacobian`.
-        places: see `joint_jacobian`.
+        places: (m,) the neighbour of each measurement, -1: none.
     """
     at = np.zeros(len(P))
-    residual, H, N = looked(kind, R, p, at, frame, constants, turns, places)
+    residual, H, N = looked(kind, R, p, at, frame, constants, places)
     _, dx, nis = gain(P, H, N, residual)
     for n in range(6 + len(constants[1])):
         at[n] = 0.5 * dx[n]
-    residual, H, N = looked(kind, R, p, at, frame, constants, turns, places)
+    residual, H, N = looked(kind, R, p, at, frame, constants, places)
     K, dx, _ = gain(P, H, N, residual + transformed(H, at))
     return K, H, N, dx, nis
 
@@ -291,7 +289,7 @@ def halfway_gain(
 def own_gain(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, Array, float]:
     """Return the result of `halfway_gain` without neighbours and constants."""
     none = np.zeros((6, 0)), np.zeros(0)
-    return halfway_gain(kind, R, p, P, frame, none, np.zeros((0, 3, 3)), np.full(len(frame[0]), -1))
+    return halfway_gain(kind, R, p, P, frame, none, np.full(len(frame[0]), -1))
 
 
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)

@@ -10,8 +10,8 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from coopenv.estimation.compiled import MATRIX, WHOLE, compiled, congruent, place
-from coopenv.estimation.poses import Array
+from coopenv.estimation.compiled import NUMBER, WHOLE
+from coopenv.estimation.poses import IDENTITY, Array
 from coopenv.measurements.kinds import MOST_ROWS
 from coopenv.measurements.sensor import MAP, Sensor
 from coopenv.observers.contract import Message, Tick
@@ -48,18 +48,18 @@ ENTRY = np.dtype(
         ("target", np.int64),  # or `MAP`
         ("value", np.float64, MOST_ROWS),
         ("position", np.float64, 3),  # of the target as known or reported, map frame, m
-        ("rotation", np.float64, (3, 3)),  # likewise, NaN where not known; of a target of the camera zero
+        ("rotation", np.float64, (3, 3)),  # likewise, NaN or zero where not known
         ("velocity", np.float64, 3),  # likewise, map axes, m/s
-        ("covariance", np.float64, (6, 6)),  # of a turn of the target about own axes and of its position in map axes
+        ("covariance", np.float64, (6, 6)),  # of turn and shift of the target in its axes, or in the map's if not known
     ],
     align=True,
 )
 
 
 RECORDS = {dtype: types.Array(numba.from_dtype(dtype), 1, "A", readonly=True) for dtype in (ENTRY, SENSOR)}
-FRAME = types.Tuple((RECORDS[ENTRY], RECORDS[SENSOR], WHOLE))
+FRAME = types.Tuple((RECORDS[ENTRY], RECORDS[SENSOR], NUMBER, WHOLE))
 """The first fields of `UsableMeasurements`, for compiled functions."""
-Frame = tuple[NDArray[Any], NDArray[Any], int]
+Frame = tuple[NDArray[Any], NDArray[Any], float, int]
 
 ticks_of_own_kinds: WeakValueDictionary[int, Tick] = WeakValueDictionary()
 """Ticks with measurements of kinds that are not compiled, by `UsableMeasurements.own`."""
@@ -70,6 +70,7 @@ class UsableMeasurements(NamedTuple):
 
     entries: NDArray[Any]  # (m,) `ENTRY`
     sensors: NDArray[Any]  # (s,) `SENSOR` of the vehicle, the camera first
+    weight: float  # factor on the covariances of the targets; 0 if they count as known exactly
     own: int  # key of the tick if a sensor is of a kind that is not compiled, else 0
     messages: NDArray[Any]  # (m,) `Message`, None for landmarks
     tick: Tick
@@ -77,7 +78,7 @@ class UsableMeasurements(NamedTuple):
     @property
     def frame(self) -> Frame:
         """The arguments of compiled functions."""
-        return self[:3]
+        return self[:4]
 
     @property
     def targets(self) -> NDArray[np.int64]:
@@ -105,13 +106,11 @@ class UsableMeasurements(NamedTuple):
 
     def exact(self) -> "UsableMeasurements":
         """Return the measurements as if the targets were known exactly."""
-        return self.inflated(0.0)
+        return self._replace(weight=0.0)
 
     def inflated(self, factor: float) -> "UsableMeasurements":
         """Return the measurements with a factor on the covariances of their targets."""
-        entries = self.entries.copy()
-        entries["covariance"] *= factor
-        return self._replace(entries=entries)
+        return self._replace(weight=factor * self.weight)
 
 
 def measured_message(tick: Tick) -> Message:
@@ -129,24 +128,29 @@ def usable_measurements(tick: Tick, weighed: bool = True) -> UsableMeasurements 
         return None
     count = len(seen)
     entries, messages = np.zeros(count + len(others), ENTRY), np.empty(count + len(others), object)
-    if seen:
-        targets, bearings, positions, messages[:count] = zip(*seen, strict=True)
-        entries["target"][:count], entries["value"][:count, :3] = targets, bearings
-        entries["position"][:count] = positions
+    targets, values, positions = entries["target"], entries["value"], entries["position"]
+    for n, (target, bearing, position, message) in enumerate(seen):
+        targets[n], values[n, :3], positions[n] = target, bearing, position
+        if message is not None:
+            messages[n] = message
+            _put_report(entries, n, message)
     for n, (number, target, value, message) in enumerate(others, count):
-        entries["sensor"][n], entries["target"][n], messages[n] = number, target, message
-        entries["value"][n, : len(value)] = value
-        _put_target(entries[n], tick, target, message)
-    if weighed:
-        for n, message in enumerate(messages):
-            if message is not None and message.covariance is not None:
-                entries["covariance"][n] = reported_covariance(message)
-    readings = [reading.sensor for reading in tick.readings]
-    sensors, compiled_alone = sensors_of(tick.lever_arm.tobytes(), tick.noise.bearing_std, *readings)
-    own = 0 if compiled_alone else id(tick)
-    if own:
-        ticks_of_own_kinds[own] = tick
-    return UsableMeasurements(entries, sensors, own, messages, tick)
+        entries["sensor"][n], targets[n], values[n, : len(value)] = number, target, value
+        if message is not None:
+            messages[n], positions[n] = message, message.position
+            _put_report(entries, n, message)
+            velocity = np.asarray(message.extra.get("velocity", np.nan), float)
+            entries["velocity"][n] = velocity if velocity.shape == (3,) else np.nan
+        elif target != MAP:
+            positions[n] = tick.landmarks[target]
+            rotation = IDENTITY if tick.landmark_rotation is None else tick.landmark_rotation[target]
+            entries["rotation"][n] = rotation
+            entries["velocity"][n] = 0.0 if np.isfinite(rotation).all() else np.nan
+    lever_arm, readings = np.asarray(tick.lever_arm, float), [reading.sensor for reading in tick.readings]
+    sensors, compiled_alone = sensors_of(lever_arm.tobytes(), tick.noise.bearing_std, *readings)
+    if not compiled_alone:
+        ticks_of_own_kinds[id(tick)] = tick
+    return UsableMeasurements(entries, sensors, float(weighed), 0 if compiled_alone else id(tick), messages, tick)
 
 
 def _other_measurements(tick: Tick) -> Iterator[tuple[int, int, Array, Message | None]]:
@@ -164,22 +168,16 @@ def _other_measurements(tick: Tick) -> Iterator[tuple[int, int, Array, Message |
             yield number, target, values[n], message
 
 
-def _put_target(entry: Any, tick: Tick, target: int, message: Message | None) -> None:
-    """Write place and motion of a target as known or reported; NaN for what is not known."""
-    if message is not None:
-        entry["position"], entry["rotation"] = (
-            message.position,
-            np.nan if message.rotation is None else message.rotation,
-        )
-        velocity = np.asarray(message.extra.get("velocity", np.nan), float)
-        entry["velocity"] = velocity if velocity.shape == (3,) else np.nan
-    elif target == MAP:
-        entry["rotation"] = np.eye(3)
+def _put_report(entries: NDArray[Any], n: int, message: Message) -> None:
+    """Write orientation and covariance of a target as reported; the orientation is NaN if it is not known."""
+    R, P = message.rotation, message.covariance
+    entries["rotation"][n] = np.nan if R is None else R
+    if P is None:
+        return
+    if len(P) == 6 and R is not None:
+        entries["covariance"][n] = P
     else:
-        entry["position"] = tick.landmarks[target]
-        entry["rotation"] = np.eye(3) if tick.landmark_rotation is None else tick.landmark_rotation[target]
-        if not np.isfinite(entry["rotation"]).all():
-            entry["velocity"] = np.nan
+        entries["covariance"][n, 3:, 3:] = P[:3, :3] if R is None else R.T.dot(P).dot(R)
 
 
 @lru_cache
@@ -197,20 +195,3 @@ def sensors_of(lever_arm: bytes, bearing_std: float, *sensors: Sensor) -> tuple[
         row["variance"][:rows], row["variance_by_distance"] = np.square(sensor.std), sensor.std_by_distance**2
         row["angle"][:rows] = np.equal(sensor.kind.units, "rad") & (sensor.std < UNKNOWN_ANGLE)
     return table, OWN_KIND not in table["kind"]
-
-
-def reported_covariance(message: Message) -> Array:
-    """Return the reported covariance (6, 6) of a turn about own axes and of the position in map axes."""
-    R, P, C = message.rotation, np.asarray(message.covariance, float), np.zeros((6, 6))
-    if len(P) == 6 and R is not None:
-        return in_map_axes(np.asarray(R, float), P)
-    C[3:, 3:] = P[:3, :3]
-    return C
-
-
-@compiled(MATRIX, MATRIX)
-def in_map_axes(R: Array, P: Array) -> Array:
-    """Return the covariance (6, 6) of a left error with the position in map axes."""
-    T = np.eye(6)
-    place(T, 3, 3, R)
-    return congruent(T, P)

@@ -27,13 +27,14 @@ from coopenv.estimation.compiled import (
     MATRICES,
     MATRIX,
     VECTOR,
+    adjoint,
     compiled,
     cross_matrix,
     logarithm,
     product,
     transformed,
 )
-from coopenv.estimation.poses import Array, orthonormalise, skew
+from coopenv.estimation.poses import Array, orthonormalise
 from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick
 from coopenv.observers.correction import LARGEST, LARGEST_OF, PLACES, InnovationGate
 from coopenv.observers.frame import CAMERA, measured_message, usable_measurements
@@ -175,9 +176,7 @@ class FrameGraph:
             J = np.zeros((len(linear.residual[n]), 13))
             J[:, :6], J[:, 12] = linear.H[n], linear.residual[n]
             if j >= 0:
-                R = self.R[frame, j]
-                J[:, 9:12] = linear.by_target[n, :, 3:].dot(R)
-                J[:, 6:9] = linear.by_target[n, :, :3] - J[:, 9:12].dot(skew(self.markers[j]))
+                J[:, 6:12] = linear.by_target[n].dot(adjoint(np.eye(3), -self.markers[j]))
             information[i, j if j >= 0 else i] += J[:, :12].T.dot(weight[n][:, None] * J)
 
     def odometry(self, frame: int) -> Array:

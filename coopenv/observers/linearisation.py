@@ -39,12 +39,10 @@ from coopenv.measurements.kinds import Placed
 from coopenv.observers.frame import (
     ATTITUDE,
     BEARING,
-    ENTRY,
     FRAME,
     OWN_KIND,
     POSITION,
     RANGE,
-    RECORDS,
     RELATIVE_POSE,
     Frame,
     UsableMeasurements,
@@ -62,16 +60,17 @@ class LinearMeasurements(NamedTuple):
     residual: Array  # (m, r); of bearings rad, in the tangent planes
     H: Array  # (m, r, n) derivative of the measurement by the error
     N: Array  # (m, r, r) covariance of the residuals given the own pose
-    by_target: Array  # (m, r, 6) by a turn of the target about its own axes, and by its position in map axes
+    by_target: Array  # (m, r, 6) derivative by turn and shift of the target in the axes of its covariance
     variance: Array  # (m, r) of the sensors alone
     used: NDArray[np.bool_]  # (m, r) rows that were measured
     angle: NDArray[np.bool_]  # (m, r) rows among them that measure an angle
     ahead: NDArray[np.bool_]  # (m,) whether the points are ahead along the bearings, and not behind
-    entries: NDArray[Any]  # (m,) `ENTRY`
+    measured: UsableMeasurements
 
     def only(self, kept: NDArray[np.bool_]) -> "LinearMeasurements":
         """Return the measurements of a mask (m,)."""
-        return LinearMeasurements._make(part[kept] for part in self)
+        arrays: tuple[NDArray[Any], ...] = self[:-1]
+        return LinearMeasurements(*(array[kept] for array in arrays), self.measured.only(kept))
 
     def spread(self, P: Array) -> Array:
         """Return (m, r, r) the covariances of the innovations, given that of the error (n, n)."""
@@ -79,13 +78,13 @@ class LinearMeasurements(NamedTuple):
 
     def stacked(self) -> tuple[Array, Array, Array]:
         """Return residual (k,), H (k, n) and N (k, k) of the rows that were measured."""
-        residual, H, N = stacked(self.residual, self.H, self.N, self.by_target, self.used, self.entries)
+        residual, H, N = stacked(self.residual, self.H, self.N, self.by_target, self.used, self.measured.frame)
         return residual, H, N
 
 
 def linearised(pose: UncertainPose, measured: UsableMeasurements) -> LinearMeasurements:
     """Linearise measurements at a pose; the points' covariances are noise, as if independent of the pose."""
-    return LinearMeasurements(*linearise(pose.R, pose.p, pose.kind == RIGHT, measured.frame), measured.entries)
+    return LinearMeasurements(*linearise(pose.R, pose.p, pose.kind == RIGHT, measured.frame), measured)
 
 
 @compiled(NUMBER, NUMBER, NUMBER)
@@ -118,8 +117,8 @@ def put_sight(kind: int, value: Array, d: Array, M: Array, residual: Array, J: A
         value: as measured.
         d: from the sensor to the target, the sensor's axes, m.
         M: (3, 3) sensor to body.
-        residual: (6,) its rows.
-        J: (6, 3) derivatives by the place of the target in the body frame.
+        residual: (r,) its rows.
+        J: (r, 3) derivatives by the place of the target in the body frame.
     """
     distance, row = max(math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), 1e-9), 0
     if kind != RANGE:
@@ -168,10 +167,10 @@ def put_rows(
         R: (3, 3) body to map.
         M: (3, 3) sensor to body.
         target_R: (3, 3) target to map.
-        residual: (6,) its rows.
-        J: (6, 3) derivatives by the place z in body axes.
-        by_turn: (6, 3) derivatives by a turn of the body about its axes.
-        by_its_turn: (6, 3) derivatives by a turn of the target about its axes.
+        residual: (r,) its rows.
+        J: (r, 3) derivatives by the place z in body axes.
+        by_turn: (r, 3) derivatives by a turn of the body about its axes.
+        by_its_turn: (r, 3) derivatives by a turn of the target about its axes.
     """
     if kind == POSITION:
         for k in range(3):
@@ -199,18 +198,21 @@ def completed(
     residual: Array, H: Array, by_target: Array, variance: Array, used: NDArray[np.bool_], frame: Frame
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Clear rows that are not finite, and return N and `angle` of `LinearMeasurements`."""
-    entries, sensors, _ = frame
+    entries, sensors, weight, _ = frame
     (m, r), angle = residual.shape, np.zeros(residual.shape, np.bool_)
     N = np.zeros((m, r, r))
     for n in range(m):
         for k in range(r):
-            if not math.isfinite(residual[n, k] + np.sum(H[n, k]) + np.sum(by_target[n, k])):
+            total = residual[n, k]
+            for i in range(6):
+                total += H[n, k, i] + by_target[n, k, i]
+            if not math.isfinite(total):
                 residual[n, k], variance[n, k], used[n, k] = 0.0, 1.0, False
                 for i in range(6):
                     H[n, k, i] = by_target[n, k, i] = 0.0
             angle[n, k] = used[n, k] and sensors.angle[entries.sensor[n], k] == 1
-        if np.trace(entries.covariance[n]) > 0.0:
-            place(N[n], 0, 0, congruent(by_target[n], entries.covariance[n]))
+        if weight > 0.0 and np.trace(entries.covariance[n]) > 0.0:
+            place(N[n], 0, 0, weight * congruent(by_target[n], entries.covariance[n]))
         for k in range(r):
             N[n, k, k] += variance[n, k]
     return N, angle
@@ -221,10 +223,11 @@ def linearise(
     R: Array, p: Array, right: bool, frame: Frame
 ) -> tuple[Array, Array, Array, Array, Array, NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the first fields of `LinearMeasurements`; `right`: the error is about the map's axes."""
-    entries, sensors, own = frame
+    entries, sensors, _, own = frame
     m, r = len(entries), np.max(sensors.rows)
     residual, H, by_target, variance = np.zeros((m, r)), np.zeros((m, r, 6)), np.zeros((m, r, 6)), np.ones((m, r))
     used, ahead = np.zeros((m, r), np.bool_), np.ones(m, np.bool_)
+    J, turns = np.zeros((m, r, 3)), np.zeros((2, m, r, 3))
     for n in range(m):
         s, target = entries.sensor[n], entries.target[n]
         kind, lever_arm, M = sensors.kind[s], sensors.position[s], sensors.rotation[s]
@@ -233,18 +236,20 @@ def linearise(
         z = entries.position[n] if target >= 0 else p + transformed(R, lever_arm)
         a = transformed(R.T, z - p)
         d = transformed(M.T, a - lever_arm)
-        rows, J, by_turn, by_its_turn = np.zeros(6), np.zeros((6, 3)), np.zeros((6, 3)), np.zeros((6, 3))
-        value, its_R = entries.value[n], entries.rotation[n]
-        ahead[n] = put_rows(kind, value, z, d, R, M, its_R, rows, J, by_turn, by_its_turn)
+        value, its_R, by_turn, by_its_turn = entries.value[n], entries.rotation[n], turns[0, n], turns[1, n]
+        ahead[n] = put_rows(kind, value, z, d, R, M, its_R, residual[n], J[n], by_turn, by_its_turn)
+        known = target >= 0 and its_R[0, 0] ** 2 + its_R[1, 0] ** 2 + its_R[2, 0] ** 2 > 0.0
         by_distance = sensors.variance_by_distance[s] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
         for k in range(sensors.rows[s]):
-            g, turn = transformed(R, J[k]), by_turn[k]
+            g, turn = transformed(R, J[n, k]), by_turn[k]
             if right:
                 put_derivative(H[n, k], g, z, 1.0)
                 turn = transformed(R, turn)
             else:
-                put_derivative(H[n, k], J[k], a, 1.0)
-            residual[n, k], variance[n, k], used[n, k] = rows[k], sensors.variance[s, k] + by_distance, True
+                put_derivative(H[n, k], J[n, k], a, 1.0)
+            variance[n, k], used[n, k] = sensors.variance[s, k] + by_distance, True
+            if known:
+                g = transformed(its_R.T, g)
             for i in range(3):
                 H[n, k, i] += turn[i]
                 if target >= 0:
@@ -268,7 +273,8 @@ def put_own_kinds(
     used: NDArray[np.bool_],
 ) -> None:
     """Write the measurements of kinds that are not compiled; arguments as for `LinearMeasurements`."""
-    (entries, sensors, own), to_error = frame, np.linalg.inv(adjoint(R, p)) if right else np.eye(6)
+    entries, sensors, _, own = frame
+    to_error = np.linalg.inv(adjoint(R, p)) if right else np.eye(6)
     tick = ticks_of_own_kinds[own]
     for number in np.flatnonzero(sensors["kind"] == OWN_KIND):
         sensor = tick.readings[number - 1].sensor
@@ -282,11 +288,13 @@ def put_own_kinds(
         rows = slice(0, sensor.kind.rows)
         residual[of, rows], variance[of, rows], used[of, rows] = found.residual, found.noise, found.used
         H[of, rows], by_target[of, rows] = found.by_own @ to_error, found.by_target
+        known = np.isfinite(its["rotation"]).all(axis=(1, 2))
+        by_target[of[known], rows, 3:] = found.by_target[known, :, 3:] @ its["rotation"][known]
 
 
-@compiled(MATRIX, MATRICES, MATRICES, MATRICES, FLAG_ROWS, RECORDS[ENTRY])
+@compiled(MATRIX, MATRICES, MATRICES, MATRICES, FLAG_ROWS, FRAME)
 def stacked(
-    residual: Array, H: Array, N: Array, by_target: Array, used: NDArray[np.bool_], entries: NDArray[Any]
+    residual: Array, H: Array, N: Array, by_target: Array, used: NDArray[np.bool_], frame: Frame
 ) -> tuple[Array, Array, Array]:
     """Return residual (k,), H (k, n) and N (k, k) of the rows that were measured, with H (m, r, n).
 
@@ -310,11 +318,12 @@ def stacked(
             stacked_H[a, j] = H[n, i, j]
         for b in range(first[n], first[n + 1]):
             stacked_N[a, b] = N[n, i, at[b, 1]]
+    entries, _, weight, _ = frame
     for n in range(m):
         C, target = entries.covariance[n], entries.target[n]
         for l in range(n):  # noqa: E741
-            if entries.target[l] == target and target >= 0 and np.trace(C) > 0.0:
-                both = product(product(by_target[n], C), by_target[l].T)
+            if entries.target[l] == target and target >= 0 and weight * np.trace(C) > 0.0:
+                both = weight * product(product(by_target[n], C), by_target[l].T)
                 for a in range(first[n], first[n + 1]):
                     for b in range(first[l], first[l + 1]):
                         stacked_N[a, b] = stacked_N[b, a] = both[at[a, 1], at[b, 1]]

@@ -33,7 +33,7 @@ class PoseObserver:
     def __init__(self, setup: Setup) -> None:
         self.marker = setup.marker  # the point that sensors of other vehicles measure
         self.needed = {name for sensor in setup.sensors for name in sensor.kind.needs}
-        self.twist = np.zeros((2, 3))  # m/s and rad/s, body axes
+        self.twist = np.zeros(3), np.zeros(3)  # m/s and rad/s, body axes
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
@@ -82,7 +82,7 @@ class Mekf(PoseObserver):
 
     def predict(self, tick: Tick) -> None:
         """Append the increment."""
-        self.twist = np.array([tick.velocity, tick.angular_velocity])
+        self.twist = tick.velocity, tick.angular_velocity
         self.state = self.state.predicted(tick)
 
     def take(self, tick: Tick, measured: UsableMeasurements) -> None:

@@ -20,13 +20,12 @@ Sigma_ij is kept by i and propagated by j's factor.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from coopenv.estimation.compiled import (
-    MATRICES,
     MATRIX,
     VECTOR,
     adjoint,
@@ -49,12 +48,10 @@ SHRINKING = (0.98, 0.9, 0.7, 0.4, 0.0)
 """Factors on cross-covariances that make the joint covariance positive definite, if the received ones do not."""
 
 
-@dataclass(frozen=True)
-class ConsideredNeighbour:
+class ConsideredNeighbour(NamedTuple):
     """The last report of a neighbour, and its covariance with the own error."""
 
     number: int  # of its last message
-    R: Array  # (3, 3) as reported
     P: Array  # (6, 6) as reported, about its marker
     cross: Array  # (6, 6) C_ij
 
@@ -84,13 +81,14 @@ class ConsiderFilter(Mekf):
         """Start at a pose that is independent of the other vehicles."""
         super().reset(initial_pose, initial_covariance)
         self.neighbours: dict[int, ConsideredNeighbour] = {}
-        self.factor, self.number = np.eye(len(self.covariance)), 0
+        self.identity = np.eye(len(self.covariance))
+        self.factor, self.number = self.identity, 0
 
     def message(self) -> Message:
         """Return the marker's pose and covariance, and the factor since the last message with its number."""
         T = self.to_marker
         factor = T.dot(self.factor[:6, :6]).dot(self.from_marker)
-        self.factor, self.number = np.eye(len(self.factor)), self.number + 1
+        self.factor, self.number = self.identity, self.number + 1
         extra = {"factor": factor, "number": np.array([self.number]), **self.extra()}
         position = self.state.p + self.state.R.dot(self.marker)
         return Message(position, self.state.R, T.dot(self.state.P).dot(T.T), extra)
@@ -103,8 +101,8 @@ class ConsiderFilter(Mekf):
     def propagate_cross_covariances(self, A: Array, others: Sequence[int] | None = None) -> None:
         """Multiply the own error by A in the factor and in the cross-covariances with `others` (None: all)."""
         for j in self.neighbours if others is None else others:
-            of = self.neighbours[j]
-            self.neighbours[j] = ConsideredNeighbour(of.number, of.R, of.P, A.dot(of.cross))
+            number, P, cross = self.neighbours[j]
+            self.neighbours[j] = ConsideredNeighbour(number, P, A.dot(cross))
         self.factor = A.dot(self.factor)
 
     def take(self, tick: Tick, measured: UsableMeasurements) -> None:
@@ -119,10 +117,7 @@ class ConsiderFilter(Mekf):
         S = linear.spread(self.covariance)
         for n, target in enumerate(measured.targets.tolist()):
             if target in self.neighbours:
-                of = self.neighbours[target]
-                by_target = linear.by_target[n]
-                common = linear.H[n].dot(of.cross[:, 3:]).dot(by_target[:, 3:].dot(of.R).T)
-                common += linear.H[n].dot(of.cross[:, :3]).dot(by_target[:, :3].T)
+                common = linear.H[n].dot(self.neighbours[target].cross).dot(linear.by_target[n].T)
                 S[n] += common + common.T
         return S
 
@@ -140,7 +135,7 @@ class ConsiderFilter(Mekf):
             lost = max(1, min(now - of.number, MOST_LOST))
             cross = cross.dot(factor.T if lost == 1 else np.linalg.matrix_power(factor, lost).T)
         cross = bounded(cross, self.covariance, np.asarray(message.covariance, float))
-        self.neighbours[target] = ConsideredNeighbour(now, message.rotation, message.covariance, cross)
+        self.neighbours[target] = ConsideredNeighbour(now, message.covariance, cross)
 
     def fuse(self, measured: UsableMeasurements, between: Array | None = None) -> tuple[float, int]:
         """Correct by measurements of landmarks and of neighbours that are known; return what `Mekf.fuse` returns.
@@ -151,14 +146,13 @@ class ConsiderFilter(Mekf):
         of = [self.neighbours[t] for t in seen]
         joint = self.joint_covariance(of, between)
         places = np.array([seen.index(t) if t in self.neighbours else -1 for t in targets])
-        turns = np.array([one.R for one in of], float).reshape(-1, 3, 3)
         frame = measured.exact().frame
-        made = considered(self.state.R, self.state.p, joint, frame, self.constants, turns, places)
+        made = considered(self.state.R, self.state.p, joint, frame, self.constants, places)
         R, p, P, change, carried, crosses, nis, dof = made
         self.set_corrected(R, p, P, change)
         self.propagate_cross_covariances(carried, [t for t in self.neighbours if t not in seen])
         for target, was, cross in zip(seen, of, crosses, strict=True):
-            self.neighbours[target] = ConsideredNeighbour(was.number, was.R, was.P, cross)
+            self.neighbours[target] = ConsideredNeighbour(was.number, was.P, cross)
         return float(nis), dof
 
     def set_corrected(self, R: Array, p: Array, P: Array, change: Array) -> None:
@@ -173,16 +167,17 @@ class ConsiderFilter(Mekf):
         """Return the joint covariance of the own error and those of neighbours, which is positive definite."""
         own = len(self.covariance)
         size = own + 6 * len(of)
-        joint, alone = np.zeros((size, size)), np.zeros((size, size))
-        joint[:own, :own], alone[:own, :own] = self.covariance, 1.0
+        joint = np.zeros((size, size))
+        joint[:own, :own] = self.covariance
         for n, one in enumerate(of):
             k = slice(own + 6 * n, own + 6 * n + 6)
-            joint[k, k], joint[:own, k], joint[k, :own], alone[k, k] = one.P, one.cross, one.cross.T, 1.0
+            joint[k, k], joint[:own, k], joint[k, :own] = one.P, one.cross, one.cross.T
             if between is not None:
                 joint[k, own : k.start] = between[n, :n].transpose(1, 0, 2).reshape(6, -1)
                 joint[own : k.start, k] = joint[k, own : k.start].T
         if not of or _has_factor(joint):
             return joint
+        alone = block_diag(np.ones((own, own)), *[np.ones((6, 6))] * len(of))
         for factor in SHRINKING:
             shrunk = joint * (alone + factor * (1.0 - alone))
             if _has_factor(shrunk):
@@ -190,9 +185,9 @@ class ConsiderFilter(Mekf):
         return shrunk
 
 
-@compiled(MATRIX, VECTOR, MATRIX, FRAME, CONSTANTS, MATRICES, PLACES)
+@compiled(MATRIX, VECTOR, MATRIX, FRAME, CONSTANTS, PLACES)
 def considered(
-    R: Array, p: Array, joint: Array, frame: Frame, constants: Constants, turns: Array, places: Any
+    R: Array, p: Array, joint: Array, frame: Frame, constants: Constants, places: Any
 ) -> tuple[Array, Array, Array, Array, Array, Array, float, int]:
     """Correct the own error, linearised half way (correction.py); neighbours are considered (Schmidt).
 
@@ -202,14 +197,13 @@ def considered(
         joint: (n + 6k, n + 6k) covariance of the own error and those of k neighbours.
         frame: the measurements; targets have no covariances.
         constants: of the camera, n - 6 of them.
-        turns: (k, 3, 3) the neighbours' orientations.
         places: (m,) the neighbour of each measurement, -1: none.
 
     Returns:
         Orientation, position, covariance (n, n), change of the constants (n - 6,), the factor (n, n) of the other
         cross-covariances, those with the neighbours (k, n, 6), r^T S^-1 r at the prediction, and the number of rows.
     """
-    K, whole, N, dx, nis = halfway_gain(LEFT, R, p, joint, frame, constants, turns, places)
+    K, whole, N, dx, nis = halfway_gain(LEFT, R, p, joint, frame, constants, places)
     own = 6 + len(constants[1])
     K[own:] = 0.0
     after = joseph(joint, K, whole, N)
@@ -218,8 +212,8 @@ def considered(
     place(recentred, 0, 0, recentring(LEFT, dx[:6]))
     P = congruent(recentred, after[:own, :own])
     carried = eliminated(joint[:own, :own], product(after[:own, :own], recentred.T)).T
-    crosses = np.empty((len(turns), own, 6))
-    for n in range(len(turns)):
+    crosses = np.empty(((len(joint) - own) // 6, own, 6))
+    for n in range(len(crosses)):
         place(crosses[n], 0, 0, product(recentred, after[:own, own + 6 * n : own + 6 * n + 6]))
     return R, p, P, dx[6:own], carried, crosses, nis, len(N)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Setup, Tick
-from coopenv.observers.correction import Constants, with_constants
+from coopenv.observers.correction import Constants, joint_jacobian
 from coopenv.observers.frame import UsableMeasurements
 from coopenv.observers.lasting_errors import LastingErrors
 from coopenv.observers.linearisation import LinearMeasurements
@@ -44,7 +44,7 @@ class SelfCalibrating(SchmidtKalman):
 
     def predict(self, tick: Tick) -> None:
         """Append the increment without its lasting errors."""
-        self.twist = np.array([tick.velocity, tick.angular_velocity])
+        self.twist = tick.velocity, tick.angular_velocity
         step, noise = self.lasting.step(tick, self.values), tick.noise.odometry(tick.dt)
         A = np.eye(len(self.P))
         A[:6, :6], A[:6, 6:] = transition(step.rotation, step.translation), step.by_errors
@@ -61,8 +61,9 @@ class SelfCalibrating(SchmidtKalman):
     def linearised(self, measured: UsableMeasurements) -> LinearMeasurements:
         """Return the measurements linearised at the estimate, also by the lasting errors."""
         linear = super().linearised(measured)
-        residual, H = with_constants(linear.residual, linear.H, linear.entries, self.constants)
-        return linear._replace(residual=residual, H=H)
+        none = np.full(len(measured.entries), -1)
+        H = joint_jacobian(*linear[:2], linear.by_target, measured.frame, np.eye(6), self.constants, none, 0)
+        return linear._replace(H=H)
 
     def set_corrected(self, R: Array, p: Array, P: Array, change: Array) -> None:
         """Set the corrected pose and lasting errors."""
