@@ -39,9 +39,9 @@ from coopenv.estimation.compiled import adjoint
 from coopenv.estimation.poses import Array, exp_so3, orthonormalise, skew
 from coopenv.observers import uncertain_pose
 from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick
-from coopenv.observers.correction import InnovationGate, Stacked, gain, joseph
+from coopenv.observers.correction import InnovationGate, Stacked, gain, joseph, judged
 from coopenv.observers.frame import UsableMeasurements, measured_message, usable_measurements
-from coopenv.observers.linearisation import LinearMeasurements, linearised
+from coopenv.observers.linearisation import LinearMeasurements, linearised, spread
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, transition
 
 
@@ -116,7 +116,10 @@ class Centralised:
         """Correct by the measurements of vehicles that pass the vehicles' gates, in one update."""
         before, P = self.poses, self.P
         linear = {i: self.linearise(i, of) for i, of in measured.items()}
-        kept = {i: self.gates[i].passed(ticks[i].time, of, of.spread(P)) for i, of in linear.items()}
+        kept = {
+            i: self.gates[i].passed(ticks[i].time, judged(of.residual, spread(of.H, P, of.N), *of[5:8]))
+            for i, of in linear.items()
+        }
         residual, H, N = _stacked([of.only(kept[i]) for i, of in linear.items()])
         if not len(residual):
             return

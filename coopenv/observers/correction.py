@@ -45,9 +45,9 @@ from coopenv.observers.frame import CAMERA, FRAME, Frame, UsableMeasurements
 from coopenv.observers.linearisation import (
     FLAG_ROWS,
     FLAGS,
-    LinearMeasurements,
     linearise,
     normalised,
+    spread,
     stacked,
 )
 from coopenv.observers.uncertain_pose import RIGHT, UncertainPose, corrected, moved, recentring
@@ -90,10 +90,9 @@ def joseph(P: Array, K: Array, H: Array, N: Array) -> Array:
 
 def look_from(state: UncertainPose, measured: UsableMeasurements) -> Look:
     """Return measurements as a function of the own error about a predicted pose."""
-    places = np.full(len(measured.entries), -1)
 
     def look(at: Array) -> Stacked:
-        seen: Stacked = looked(state.kind, state.R, state.p, at, measured.frame, NO_CONSTANTS, places)
+        seen: Stacked = looked(state.kind, state.R, state.p, at, measured.frame, NO_CONSTANTS, NO_PLACES)
         return seen
 
     return look
@@ -146,6 +145,11 @@ OPENING_SHARE, CLOSING_SHARE = 0.6, 0.1
 of two does not open the gate; one of three keeps it open."""
 
 
+Judgement = tuple[NDArray[np.bool_], NDArray[np.bool_], float, float]
+"""(m,) which S are covariances, (m,) which measurements fit, the share of the others, and the largest trace, rad^2, of
+the rows that measure an angle."""
+
+
 class InnovationGate:
     """Innovation gate of one vehicle."""
 
@@ -154,15 +158,14 @@ class InnovationGate:
         self.is_open = False
         self.time = 0.0  # s, of the last frame
 
-    def passed(self, time: float, linear: LinearMeasurements, S: Array) -> NDArray[np.bool_]:
-        """Return (m,) which measurements of a frame are accepted.
+    def passed(self, time: float, judgement: Judgement) -> NDArray[np.bool_]:
+        """Return (m,) which measurements of a frame are accepted; a measurement with an invalid S never is.
 
         Args:
             time: s.
-            linear: the measurements.
-            S: (m, r, r) covariances of their residuals; a measurement with an invalid one is never accepted.
+            judgement: of the frame.
         """
-        definite, fits, rejected, widest = judged(linear.residual, S, linear.used, linear.angle, linear.ahead)
+        definite, fits, rejected, widest = judgement
         self.share += (rejected - self.share) * min(1.0, max(0.0, time - self.time) / AVERAGING)
         if widest > WIDE:
             self.share = 1.0
@@ -175,11 +178,8 @@ class InnovationGate:
 @compiled(MATRIX, MATRICES, FLAG_ROWS, FLAG_ROWS, FLAGS)
 def judged(
     residual: Array, S: Array, used: NDArray[np.bool_], angle: NDArray[np.bool_], ahead: NDArray[np.bool_]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], float, float]:
-    """Return (m,) which S are covariances, (m,) which measurements fit, the share of the others, and the largest trace.
-
-    The trace is that of the rows that measure an angle, rad^2. Arguments are as for `LinearMeasurements`.
-    """
+) -> Judgement:
+    """Return how measurements with covariances S (m, r, r) are judged; arguments as for `LinearMeasurements`."""
     squared, widest = normalised(residual, S), 0.0
     definite, fits = np.empty(len(S), np.bool_), np.empty(len(S), np.bool_)
     for n in range(len(S)):
@@ -200,6 +200,7 @@ Constants = tuple[Array, Array]
 """Constants of the camera behind the own pose in a state: the left error of the pose (6, c) that moves bearings as each
 of the constants does, and their values (c,)."""
 NO_CONSTANTS = np.zeros((6, 0)), np.zeros(0)
+NO_PLACES = np.zeros(0, np.int64)  # without neighbours
 
 
 @compiled(TARGET, MATRICES, MATRICES, FRAME, MATRIX, CONSTANTS, PLACES, WHOLE)
@@ -222,7 +223,7 @@ def joint_jacobian(
         frame: the measurements.
         recentring: (6, 6) of the error of the own pose.
         constants: of the camera.
-        places: (m,) the neighbour of each measurement, -1: none.
+        places: (m,) the neighbour of each measurement, -1: none; empty without neighbours.
         neighbours: k.
     """
     (m, r, _), (by_pose, values) = H.shape, constants
@@ -236,7 +237,7 @@ def joint_jacobian(
             explained = transformed(columns, values)
             for k in range(r):
                 residual[n, k] -= explained[k]
-        if places[n] >= 0:
+        if len(places) > 0 and places[n] >= 0:
             place(whole[n], 0, own + 6 * places[n], by_target[n])
     return whole
 
@@ -273,7 +274,7 @@ def halfway_gain(
         P: (n, n) covariance of the own error, of constants, and of the errors of some neighbours.
         frame: the measurements.
         constants: of the camera.
-        places: (m,) the neighbour of each measurement, -1: none.
+        places: see `joint_jacobian`.
     """
     at = np.zeros(len(P))
     residual, H, N = looked(kind, R, p, at, frame, constants, places)
@@ -285,16 +286,21 @@ def halfway_gain(
     return K, H, N, dx, nis
 
 
-@compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)
-def own_gain(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, Array, float]:
-    """Return the result of `halfway_gain` without neighbours and constants."""
-    none = np.zeros((6, 0)), np.zeros(0)
-    return halfway_gain(kind, R, p, P, frame, none, np.full(len(frame[0]), -1))
+@compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME, CONSTANTS, PLACES)
+def judged_frame(kind: int, R: Array, p: Array, P: Array, frame: Frame, constants: Constants, places: Any) -> Judgement:
+    """Return how measurements of a frame are judged at a prediction; arguments are those of `halfway_gain`."""
+    residual, H, N, by_target, variance, used, angle, ahead = linearise(R, p, kind == RIGHT, frame)
+    neighbours = (len(P) - 6 - len(constants[1])) // 6
+    whole = joint_jacobian(residual, H, by_target, frame, np.eye(6), constants, places, neighbours)
+    for n in range(len(places)):
+        if places[n] >= 0:  # P has the covariance of the neighbour
+            place(N[n], 0, 0, np.diag(variance[n]))
+    return judged(residual, spread(whole, P, N), used, angle, ahead)
 
 
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)
 def updated(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, float, int]:
     """Return R (3, 3), p (3,) in m, P (6, 6), r^T S^-1 r and the number of rows of the correction of a prediction."""
-    K, H, N, dx, nis = own_gain(kind, R, p, P, frame)
+    K, H, N, dx, nis = halfway_gain(kind, R, p, P, frame, (np.zeros((6, 0)), np.zeros(0)), np.zeros(0, np.int64))
     R, p, P = corrected(kind, R, p, dx, joseph(P, K, H, N))
     return R, p, P, nis, len(N)

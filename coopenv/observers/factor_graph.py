@@ -17,9 +17,8 @@ import numpy as np
 from coopenv.estimation.compiled import adjoint
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Estimate, Setup, Tick
-from coopenv.observers.correction import InnovationGate
+from coopenv.observers.correction import NO_CONSTANTS, NO_PLACES, InnovationGate, judged_frame
 from coopenv.observers.frame import usable_measurements
-from coopenv.observers.linearisation import linearised
 from coopenv.observers.pose_filters import PoseObserver, unit
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose
 
@@ -106,9 +105,8 @@ class FactorGraph(PoseObserver):
         usable, R, p = usable_measurements(tick), self.state.R, self.state.p
         if usable is None or not len((measured := usable.of_camera()).entries):
             return
-        linear = linearised(self.state, measured)
-        S = linear.spread(self.state.P)
-        measured = measured.only(self.gate.passed(tick.time, linear, S))
+        judgement = judged_frame(*self.state, measured.frame, NO_CONSTANTS, NO_PLACES)
+        measured = measured.only(self.gate.passed(tick.time, judgement))
         for n, target in enumerate(measured.targets.tolist()):
             position = measured.positions[n]
             seen = self.residuals.setdefault(target, Residuals())

@@ -147,7 +147,7 @@ def usable_measurements(tick: Tick, weighed: bool = True) -> UsableMeasurements 
             entries["rotation"][n] = rotation
             entries["velocity"][n] = 0.0 if np.isfinite(rotation).all() else np.nan
     lever_arm, readings = np.asarray(tick.lever_arm, float), [reading.sensor for reading in tick.readings]
-    sensors, compiled_alone = sensors_of(lever_arm.tobytes(), tick.noise.bearing_std, *readings)
+    sensors, compiled_alone = table_of_sensors(lever_arm.tobytes(), tick.noise.bearing_std, *readings)
     if not compiled_alone:
         ticks_of_own_kinds[id(tick)] = tick
     return UsableMeasurements(entries, sensors, float(weighed), 0 if compiled_alone else id(tick), messages, tick)
@@ -181,7 +181,7 @@ def _put_report(entries: NDArray[Any], n: int, message: Message) -> None:
 
 
 @lru_cache
-def sensors_of(lever_arm: bytes, bearing_std: float, *sensors: Sensor) -> tuple[NDArray[Any], bool]:
+def table_of_sensors(lever_arm: bytes, bearing_std: float, *sensors: Sensor) -> tuple[NDArray[Any], bool]:
     """Return the table (1 + s,) of a camera and other sensors, and whether all their kinds are compiled."""
     table = np.zeros(1 + len(sensors), SENSOR)
     table["rotation"] = np.eye(3)

@@ -36,7 +36,15 @@ from coopenv.estimation.compiled import (
 )
 from coopenv.estimation.poses import Array, orthonormalise
 from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick
-from coopenv.observers.correction import LARGEST, LARGEST_OF, PLACES, InnovationGate
+from coopenv.observers.correction import (
+    LARGEST,
+    LARGEST_OF,
+    NO_CONSTANTS,
+    NO_PLACES,
+    PLACES,
+    InnovationGate,
+    judged_frame,
+)
 from coopenv.observers.frame import CAMERA, measured_message, usable_measurements
 from coopenv.observers.linearisation import across, linearised, put_derivative
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, moved
@@ -237,8 +245,8 @@ class GraphEstimator(ABC):
         if (measured := usable_measurements(reported)) is None:
             return
         pose = UncertainPose(LEFT, graph.R[k, vehicle], graph.p[k, vehicle], self.P[vehicle])
-        linear = linearised(pose, measured)
-        kept = self.gates[vehicle].passed(tick.time, linear, linear.spread(pose.P))
+        judgement = judged_frame(*pose, measured.frame, NO_CONSTANTS, NO_PLACES)
+        kept = self.gates[vehicle].passed(tick.time, judgement)
         bearings = measured.only(kept).of_camera()
         graph.add(vehicle, bearings.targets, bearings.bearings, bearings.positions)
         if len(measured.sensors) > 1:

@@ -72,10 +72,6 @@ class LinearMeasurements(NamedTuple):
         arrays: tuple[NDArray[Any], ...] = self[:-1]
         return LinearMeasurements(*(array[kept] for array in arrays), self.measured.only(kept))
 
-    def spread(self, P: Array) -> Array:
-        """Return (m, r, r) the covariances of the innovations, given that of the error (n, n)."""
-        return spread(self.H, P, self.N)
-
     def stacked(self) -> tuple[Array, Array, Array]:
         """Return residual (k,), H (k, n) and N (k, k) of the rows that were measured."""
         residual, H, N = stacked(self.residual, self.H, self.N, self.by_target, self.used, self.measured.frame)
@@ -154,8 +150,8 @@ def put_rows(
     target_R: Array,
     residual: Array,
     J: Array,
-    by_turn: Array,
-    by_its_turn: Array,
+    H: Array,
+    by_target: Array,
 ) -> bool:
     """Write the rows of one measurement; return whether its target is ahead of the sensor.
 
@@ -169,8 +165,8 @@ def put_rows(
         target_R: (3, 3) target to map.
         residual: (r,) its rows.
         J: (r, 3) derivatives by the place z in body axes.
-        by_turn: (r, 3) derivatives by a turn of the body about its axes.
-        by_its_turn: (r, 3) derivatives by a turn of the target about its axes.
+        H: (r, 6), first the derivatives by a turn of the body that changes neither z nor the place of the sensor.
+        by_target: (r, 6), first the derivatives by a turn of the target about its axes.
     """
     if kind == POSITION:
         for k in range(3):
@@ -179,18 +175,40 @@ def put_rows(
                 J[k, i] = -R[k, i]
     elif kind == ATTITUDE:
         put_turn(value[:3], product(R, M), residual[:3])
-        place(by_turn, 0, 0, R)
+        place(H, 0, 0, R)
     elif kind == RELATIVE_POSE:
         for k in range(3):
             residual[k] = value[k] - d[k]
         turned = product(product(R, M).T, target_R)
         put_turn(value[3:], turned, residual[3:])
         place(J, 0, 0, M.T)
-        place(by_turn, 3, 0, -M.T)
-        place(by_its_turn, 3, 0, turned)
+        place(H, 3, 0, -M.T)
+        place(by_target, 3, 0, turned)
     else:
         return put_sight(kind, value, d, M, residual, J)
     return True
+
+
+@compiled(FLAG, MATRIX, VECTOR, VECTOR, VECTOR, ROW)
+def add_place(right: bool, R: Array, j: Array, a: Array, z: Array, row: Array) -> None:
+    """Add the derivative by the place of a target to a row (6,) that has one by a turn of the body.
+
+    Args:
+        right: whether the error is about the map's axes.
+        R: (3, 3) body to map.
+        j: (3,) derivative by the place in body axes.
+        a: (3,) the place in the body frame, m.
+        z: (3,) on the map, m.
+        row: (6,) is changed.
+    """
+    if right:
+        turn = transformed(R, row[:3])
+        put_derivative(row, transformed(R, j), z, 1.0)
+    else:
+        turn = row[:3].copy()
+        put_derivative(row, j, a, 1.0)
+    for i in range(3):
+        row[i] += turn[i]
 
 
 @compiled(TARGET, BLOCKS, BLOCKS, TARGET, types.Array(types.boolean, 2, "C"), FRAME)
@@ -226,34 +244,25 @@ def linearise(
     entries, sensors, _, own = frame
     m, r = len(entries), np.max(sensors.rows)
     residual, H, by_target, variance = np.zeros((m, r)), np.zeros((m, r, 6)), np.zeros((m, r, 6)), np.ones((m, r))
-    used, ahead = np.zeros((m, r), np.bool_), np.ones(m, np.bool_)
-    J, turns = np.zeros((m, r, 3)), np.zeros((2, m, r, 3))
+    J, used, ahead = np.zeros((m, r, 3)), np.zeros((m, r), np.bool_), np.ones(m, np.bool_)
     for n in range(m):
         s, target = entries.sensor[n], entries.target[n]
         kind, lever_arm, M = sensors.kind[s], sensors.position[s], sensors.rotation[s]
         if kind == OWN_KIND:
             continue
-        z = entries.position[n] if target >= 0 else p + transformed(R, lever_arm)
+        z, axes = entries.position[n] if target >= 0 else p + transformed(R, lever_arm), R
         a = transformed(R.T, z - p)
         d = transformed(M.T, a - lever_arm)
-        value, its_R, by_turn, by_its_turn = entries.value[n], entries.rotation[n], turns[0, n], turns[1, n]
-        ahead[n] = put_rows(kind, value, z, d, R, M, its_R, residual[n], J[n], by_turn, by_its_turn)
-        known = target >= 0 and its_R[0, 0] ** 2 + its_R[1, 0] ** 2 + its_R[2, 0] ** 2 > 0.0
+        its_R = entries.rotation[n]
+        ahead[n] = put_rows(kind, entries.value[n], z, d, R, M, its_R, residual[n], J[n], H[n], by_target[n])
+        if its_R[0, 0] ** 2 + its_R[1, 0] ** 2 + its_R[2, 0] ** 2 > 0.0:
+            axes = product(its_R.T, R)
         by_distance = sensors.variance_by_distance[s] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
         for k in range(sensors.rows[s]):
-            g, turn = transformed(R, J[n, k]), by_turn[k]
-            if right:
-                put_derivative(H[n, k], g, z, 1.0)
-                turn = transformed(R, turn)
-            else:
-                put_derivative(H[n, k], J[n, k], a, 1.0)
+            add_place(right, R, J[n, k], a, z, H[n, k])
             variance[n, k], used[n, k] = sensors.variance[s, k] + by_distance, True
-            if known:
-                g = transformed(its_R.T, g)
-            for i in range(3):
-                H[n, k, i] += turn[i]
-                if target >= 0:
-                    by_target[n, k, i], by_target[n, k, i + 3] = by_its_turn[k, i], g[i]
+            for i in range(3 if target >= 0 else 0):
+                by_target[n, k, i + 3] = axes[i, 0] * J[n, k, 0] + axes[i, 1] * J[n, k, 1] + axes[i, 2] * J[n, k, 2]
     if own != 0:
         with objmode():
             put_own_kinds(R, p, right, frame, residual, H, by_target, variance, used)
@@ -292,6 +301,21 @@ def put_own_kinds(
         by_target[of[known], rows, 3:] = found.by_target[known, :, 3:] @ its["rotation"][known]
 
 
+@compiled(TARGET, WHOLE, WHOLE, MATRIX, FLAGS, FLAGS)
+def put_used(
+    M: Array, row: int, column: int, block: Array, rows: NDArray[np.bool_], columns: NDArray[np.bool_]
+) -> None:
+    """Write the marked rows and columns of a block into a matrix."""
+    for i in range(len(rows)):
+        if rows[i]:
+            at = column
+            for j in range(len(columns)):
+                if columns[j]:
+                    M[row, at] = block[i, j]
+                    at += 1
+            row += 1
+
+
 @compiled(MATRIX, MATRICES, MATRICES, MATRICES, FLAG_ROWS, FRAME)
 def stacked(
     residual: Array, H: Array, N: Array, by_target: Array, used: NDArray[np.bool_], frame: Frame
@@ -300,33 +324,26 @@ def stacked(
 
     Two measurements of one uncertain target have correlated residuals.
     """
-    (m, r), k = used.shape, np.count_nonzero(used)
-    stacked_residual, stacked_H, stacked_N = np.empty(k), np.empty((k, H.shape[2])), np.zeros((k, k))
+    (m, r, width), k, row = H.shape, np.count_nonzero(used), 0
+    stacked_residual, stacked_H, stacked_N = np.empty(k), np.empty((k, width)), np.zeros((k, k))
     first = np.zeros(m + 1, np.int64)
-    at = np.empty((k, 2), np.int64)
-    row = 0
     for n in range(m):
         for i in range(r):
             if used[n, i]:
-                at[row, 0], at[row, 1] = n, i
+                stacked_residual[row] = residual[n, i]
+                for j in range(width):
+                    stacked_H[row, j] = H[n, i, j]
                 row += 1
         first[n + 1] = row
-    for a in range(k):
-        n, i = at[a]
-        stacked_residual[a] = residual[n, i]
-        for j in range(H.shape[2]):
-            stacked_H[a, j] = H[n, i, j]
-        for b in range(first[n], first[n + 1]):
-            stacked_N[a, b] = N[n, i, at[b, 1]]
+        put_used(stacked_N, first[n], first[n], N[n], used[n], used[n])
     entries, _, weight, _ = frame
-    for n in range(m):
+    for n in range(m if weight > 0.0 else 0):
         C, target = entries.covariance[n], entries.target[n]
         for l in range(n):  # noqa: E741
-            if entries.target[l] == target and target >= 0 and weight * np.trace(C) > 0.0:
+            if entries.target[l] == target and target >= 0 and np.trace(C) > 0.0:
                 both = weight * product(product(by_target[n], C), by_target[l].T)
-                for a in range(first[n], first[n + 1]):
-                    for b in range(first[l], first[l + 1]):
-                        stacked_N[a, b] = stacked_N[b, a] = both[at[a, 1], at[b, 1]]
+                put_used(stacked_N, first[n], first[l], both, used[n], used[l])
+                put_used(stacked_N, first[l], first[n], both.T, used[l], used[n])
     return stacked_residual, stacked_H, stacked_N
 
 

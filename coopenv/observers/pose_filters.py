@@ -15,7 +15,18 @@ from numpy.typing import NDArray
 from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled, exp_so3, exp_translation, transformed
 from coopenv.estimation.poses import Array, cholesky, lengths, solve
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import InnovationGate, iterated, look_from, turn_of_sight, updated
+from coopenv.observers.correction import (
+    NO_CONSTANTS,
+    NO_PLACES,
+    InnovationGate,
+    Judgement,
+    iterated,
+    judged,
+    judged_frame,
+    look_from,
+    turn_of_sight,
+    updated,
+)
 from coopenv.observers.frame import CAMERA, FRAME, Frame, UsableMeasurements, usable_measurements
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.linearisation import LinearMeasurements, across, dense, linearised, normalised
@@ -88,21 +99,16 @@ class Mekf(PoseObserver):
     def take(self, tick: Tick, measured: UsableMeasurements) -> None:
         """Correct by the bearings that pass the gate."""
         if self.gated:
-            linear = self.linearised(measured)
-            S = self.spread(measured, linear)
-            kept = self.gate.passed(tick.time, linear, S)
+            kept = self.gate.passed(tick.time, self.judged(measured))
             if not kept.all():
                 measured = measured.only(kept)
         if len(measured.entries):
             self.correct(measured)
 
-    def linearised(self, measured: UsableMeasurements) -> LinearMeasurements:
-        """Return the measurements linearised at the estimate."""
-        return linearised(self.state, measured)
-
-    def spread(self, measured: UsableMeasurements, linear: LinearMeasurements) -> Array:
-        """Return (m, r, r) the covariances of the innovations."""
-        return linear.spread(self.state.P)
+    def judged(self, measured: UsableMeasurements) -> Judgement:
+        """Return how measurements are judged at the estimate."""
+        judgement: Judgement = judged_frame(*self.state, measured.frame, NO_CONSTANTS, NO_PLACES)
+        return judgement
 
     def correct(self, measured: UsableMeasurements) -> None:
         """Correct by measurements."""
@@ -204,7 +210,8 @@ class Ukf(MekfCovariance):
         if self.gated:
             each, rows = np.arange(len(measured.entries)), linear.residual.shape[1]
             blocks = S.reshape(len(each), rows, len(each), rows)[each, :, each, :]
-            fits = self.gate.passed(tick.time, linear._replace(residual=r.reshape(-1, rows)), blocks)
+            judgement = judged(r.reshape(-1, rows), blocks, linear.used, linear.angle, linear.ahead)
+            fits = self.gate.passed(tick.time, judgement)
             kept, linear = fits.repeat(rows), linear.only(fits)
             if not kept.any():
                 return

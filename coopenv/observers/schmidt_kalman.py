@@ -23,6 +23,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from coopenv.estimation.compiled import (
@@ -37,9 +38,17 @@ from coopenv.estimation.compiled import (
 )
 from coopenv.estimation.poses import Array, cholesky
 from coopenv.observers.contract import Message, Setup, Tick
-from coopenv.observers.correction import CONSTANTS, NO_CONSTANTS, PLACES, Constants, halfway_gain, joseph
+from coopenv.observers.correction import (
+    CONSTANTS,
+    NO_CONSTANTS,
+    PLACES,
+    Constants,
+    Judgement,
+    halfway_gain,
+    joseph,
+    judged_frame,
+)
 from coopenv.observers.frame import FRAME, Frame, UsableMeasurements
-from coopenv.observers.linearisation import LinearMeasurements
 from coopenv.observers.pose_filters import Mekf
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, moved, recentring, transition
 
@@ -112,14 +121,12 @@ class ConsiderFilter(Mekf):
                 self.receive(target, message)
         super().take(tick, measured)
 
-    def spread(self, measured: UsableMeasurements, linear: LinearMeasurements) -> Array:
-        """Return (m, 2, 2) the covariances of the innovations, cross-covariances included."""
-        S = linear.spread(self.covariance)
-        for n, target in enumerate(measured.targets.tolist()):
-            if target in self.neighbours:
-                common = linear.H[n].dot(self.neighbours[target].cross).dot(linear.by_target[n].T)
-                S[n] += common + common.T
-        return S
+    def judged(self, measured: UsableMeasurements) -> Judgement:
+        """Return how measurements are judged at the estimate, cross-covariances included."""
+        seen, places = self.places(measured)
+        joint = self.joint_covariance(seen)
+        judgement: Judgement = judged_frame(*self.state[:3], joint, measured.frame, self.constants, places)
+        return judgement
 
     def receive(self, target: int, message: Message) -> None:
         """Take the report of a neighbour, if it runs the same observer."""
@@ -142,10 +149,9 @@ class ConsiderFilter(Mekf):
 
         `between` (n, n, 6, 6) holds the covariances of the neighbours with each other, in the order of `seen`.
         """
-        targets, seen = measured.targets.tolist(), self.seen(measured)
+        seen, places = self.places(measured)
         of = [self.neighbours[t] for t in seen]
-        joint = self.joint_covariance(of, between)
-        places = np.array([seen.index(t) if t in self.neighbours else -1 for t in targets])
+        joint = made_definite(self.joint_covariance(seen, between), len(self.covariance))
         frame = measured.exact().frame
         made = considered(self.state.R, self.state.p, joint, frame, self.constants, places)
         R, p, P, change, carried, crosses, nis, dof = made
@@ -163,26 +169,36 @@ class ConsiderFilter(Mekf):
         """Return the known neighbours among the targets, each once."""
         return [target for target in dict.fromkeys(measured.targets.tolist()) if target in self.neighbours]
 
-    def joint_covariance(self, of: Sequence[ConsideredNeighbour], between: Array | None) -> Array:
-        """Return the joint covariance of the own error and those of neighbours, which is positive definite."""
+    def places(self, measured: UsableMeasurements) -> tuple[list[int], NDArray[np.int64]]:
+        """Return the known neighbours among the targets, and (m,) which of them each measurement has, -1: none."""
+        seen = self.seen(measured)
+        return seen, np.array([seen.index(t) if t in seen else -1 for t in measured.targets.tolist()])
+
+    def joint_covariance(self, seen: Sequence[int], between: Array | None = None) -> Array:
+        """Return the joint covariance of the own error and those of neighbours; `between` as for `fuse`."""
         own = len(self.covariance)
-        size = own + 6 * len(of)
+        size = own + 6 * len(seen)
         joint = np.zeros((size, size))
         joint[:own, :own] = self.covariance
-        for n, one in enumerate(of):
-            k = slice(own + 6 * n, own + 6 * n + 6)
-            joint[k, k], joint[:own, k], joint[k, :own] = one.P, one.cross, one.cross.T
-            if between is not None:
+        for n, target in enumerate(seen):
+            k, (_, P, cross) = slice(own + 6 * n, own + 6 * n + 6), self.neighbours[target]
+            joint[k, k], joint[:own, k], joint[k, :own] = P, cross, cross.T
+            if between is not None and n:
                 joint[k, own : k.start] = between[n, :n].transpose(1, 0, 2).reshape(6, -1)
                 joint[own : k.start, k] = joint[k, own : k.start].T
-        if not of or _has_factor(joint):
-            return joint
-        alone = block_diag(np.ones((own, own)), *[np.ones((6, 6))] * len(of))
-        for factor in SHRINKING:
-            shrunk = joint * (alone + factor * (1.0 - alone))
-            if _has_factor(shrunk):
-                return shrunk
-        return shrunk
+        return joint
+
+
+def made_definite(joint: Array, own: int) -> Array:
+    """Return a joint covariance, with smaller cross-covariances if it is not positive definite."""
+    if len(joint) == own or _has_factor(joint):
+        return joint
+    alone = block_diag(np.ones((own, own)), *[np.ones((6, 6))] * ((len(joint) - own) // 6))
+    for factor in SHRINKING:
+        shrunk: Array = joint * (alone + factor * (1.0 - alone))
+        if _has_factor(shrunk):
+            break
+    return shrunk
 
 
 @compiled(MATRIX, VECTOR, MATRIX, FRAME, CONSTANTS, PLACES)

@@ -9,10 +9,8 @@ import numpy as np
 
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Setup, Tick
-from coopenv.observers.correction import Constants, joint_jacobian
-from coopenv.observers.frame import UsableMeasurements
+from coopenv.observers.correction import Constants
 from coopenv.observers.lasting_errors import LastingErrors
-from coopenv.observers.linearisation import LinearMeasurements
 from coopenv.observers.schmidt_kalman import SchmidtKalman
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose, predicted, transition
 
@@ -57,13 +55,6 @@ class SelfCalibrating(SchmidtKalman):
     def constants(self) -> Constants:
         """The lasting errors, of which those of the camera's orientation move bearings."""
         return self.by_pose, self.values
-
-    def linearised(self, measured: UsableMeasurements) -> LinearMeasurements:
-        """Return the measurements linearised at the estimate, also by the lasting errors."""
-        linear = super().linearised(measured)
-        none = np.full(len(measured.entries), -1)
-        H = joint_jacobian(*linear[:2], linear.by_target, measured.frame, np.eye(6), self.constants, none, 0)
-        return linear._replace(H=H)
 
     def set_corrected(self, R: Array, p: Array, P: Array, change: Array) -> None:
         """Set the corrected pose and lasting errors."""

@@ -26,9 +26,9 @@ from coopenv.world.model import BLIND, IDEAL, Precision, model_struct
 from coopenv.world.random import (
     SENSOR,
     STREAMS_PER_SENSOR,
+    gaussian_pair,
     pair,
     random_words,
-    six_gaussians,
     uniform,
 )
 from coopenv.world.sensor_information import clear_information, inform_of
@@ -96,10 +96,27 @@ def stream_of(sensor: int, purpose: wp.uint32) -> wp.uint32:
 
 
 @wp.func
-def six_normals(state: Any, world: int, index: int, subject: int, stream: wp.uint32, like: Any, empty: Any):
-    """Return a vector of six independent standard normal numbers."""
-    a, b = six_gaussians(state.seed[world], state.episode[world], index, subject, stream, like)
-    return type(empty)(a[0], a[1], a[2], b[0], b[1], b[2])
+def normals(state: Any, world: int, index: int, subject: int, stream: wp.uint32, rows: int, empty: Any):
+    """Return a vector of six numbers, of which at least the first `rows` are independent and standard normal.
+
+    Numbers that no row needs are not drawn: most kinds have one to three rows.
+    """
+    one = empty.dtype(1.0)
+    seed = state.seed[world]
+    episode = state.episode[world]
+    words = random_words(seed, episode, index, subject, stream)
+    x, y = gaussian_pair(words[0], words[1], one)
+    result = type(empty)(x, y, one - one, one - one, one - one, one - one)
+    if rows > 2:
+        x, y = gaussian_pair(words[2], words[3], one)
+        result[2] = x
+        result[3] = y
+    if rows > 4:
+        words = random_words(seed, episode, index, subject, stream + wp.uint32(1))
+        x, y = gaussian_pair(words[0], words[1], one)
+        result[4] = x
+        result[5] = y
+    return result
 
 
 @wp.func
@@ -119,7 +136,7 @@ def carry_errors(model: Any, state: Any, world: int, vehicle: int, sensor: int, 
     seed = state.seed[world]
     episode = state.episode[world]
     if own.correlated[0] > zero:
-        fresh = six_normals(state, world, tick, vehicle, stream_of(sensor, DRIFT), like, own.std)
+        fresh = normals(state, world, tick, vehicle, stream_of(sensor, DRIFT), own.rows, own.std)
         keeps = wp.where(tick == 0, zero, own.correlation)
         step = wp.cw_mul(own.correlated, fresh) * wp.sqrt(one - keeps * keeps)
         state.sensor_drift[world, vehicle, sensor] = keeps * state.sensor_drift[world, vehicle, sensor] + step
@@ -187,10 +204,10 @@ def noise_of(model: Any, state: Any, world: int, vehicle: int, sensor: int, targ
     like = own.position
     one = like.dtype(1.0)
     subject = pair(vehicle, target)
-    white = six_normals(state, world, tick, subject, stream_of(sensor, WHITE), like, own.std)
+    white = normals(state, world, tick, subject, stream_of(sensor, WHITE), own.rows, own.std)
     noise = wp.cw_mul(own.std, white) + state.sensor_drift[world, vehicle, sensor]
     if own.bias[0] > one - one:
-        noise += wp.cw_mul(own.bias, six_normals(state, world, 0, vehicle, stream_of(sensor, BIAS), like, own.std))
+        noise += wp.cw_mul(own.bias, normals(state, world, 0, vehicle, stream_of(sensor, BIAS), own.rows, own.std))
     if own.outlier_probability > one - one:
         words = random_words(state.seed[world], state.episode[world], tick, subject, stream_of(sensor, DETECTION))
         if uniform(words[1], one) < own.outlier_probability:

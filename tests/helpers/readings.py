@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from coopenv.estimation.poses import Array
 from coopenv.measurements.kinds import Placed
 from coopenv.measurements.sensor import MAP, Sensor
+from coopenv.observers.frame import ENTRY, Frame, table_of_sensors
 from coopenv.observers.recording import Recording
 from coopenv.observers.setups import landmark_rotations, sensors_of
 from coopenv.runs.recorder import record
@@ -66,3 +68,15 @@ def with_readings(recording: Recording, sensors: list[dict[str, Any]], seed: int
 def recorded(name: str, sensors: list[dict[str, Any]], seed: int = 0, blind: bool = False, **keys: Any) -> Recording:
     """Return the recording of an environment with such sensors."""
     return with_readings(record(load_scenario(name, keys), seed), sensors, seed, blind)
+
+
+def frame_of_bearings(
+    lever_arm: Array, bearings: Array, points: Array, variance: float, covariances: Array | None = None
+) -> Frame:
+    """Return the arguments of compiled functions for bearings (m, 3) of a camera to points (m, 3)."""
+    entries = np.zeros(len(points), ENTRY)
+    entries["target"], entries["value"][:, :3], entries["position"] = np.arange(len(points)), bearings, points
+    if covariances is not None:
+        entries["covariance"][:, 3:, 3:] = covariances
+    sensors, _ = table_of_sensors(np.asarray(lever_arm, float).tobytes(), float(np.sqrt(variance)))
+    return entries, sensors, 1.0, 0

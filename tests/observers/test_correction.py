@@ -14,8 +14,7 @@ from scipy.stats import chi2
 
 from coopenv.estimation.poses import right_jacobian
 from coopenv.observers import Coordinates, Estimate, Recording, SensorNoise, run
-from coopenv.observers.correction import LARGEST, InnovationGate, iterated
-from coopenv.observers.frame import LinearMeasurements
+from coopenv.observers.correction import LARGEST, InnovationGate, Judgement, iterated, judged
 from coopenv.observers.pose_filters import SPREAD, LeftInvariant, Mekf, MekfCovariance, Ukf, sigma_points
 from coopenv.observers.uncertain_pose import INVARIANT, LEFT, RIGHT, UncertainPose, recentring
 from coopenv.runs.recorder import record
@@ -175,14 +174,14 @@ def residuals(*sizes: float) -> np.ndarray:
 
 
 def passed(gate: InnovationGate, time: float, *sizes: float, ahead: np.ndarray = ALL) -> list[bool]:
-    linear = bearings(residuals(*sizes), ahead[: len(sizes)])
-    return gate.passed(time, linear, np.tile(S, (len(sizes), 1, 1))).tolist()
+    judgement = judgement_of(residuals(*sizes), np.tile(S, (len(sizes), 1, 1)), ahead[: len(sizes)])
+    return gate.passed(time, judgement).tolist()
 
 
-def bearings(residual: np.ndarray, ahead: np.ndarray) -> LinearMeasurements:
-    """Return bearings with residuals (m, 2), of which a gate reads no derivatives."""
-    none = np.zeros((len(residual), 2, 6))
-    return LinearMeasurements(residual, none, none[..., :2], none[..., :3], ahead)
+def judgement_of(residual: np.ndarray, S: np.ndarray, ahead: np.ndarray) -> Judgement:
+    """Return how bearings with residuals (m, 2) are judged."""
+    every = np.ones(residual.shape, bool)
+    return judged(residual, S, every, every, ahead)
 
 
 def test_the_gate_refuses_one_honest_bearing_of_a_thousand() -> None:
@@ -198,7 +197,7 @@ def test_a_covariance_that_is_none_takes_nothing() -> None:
     gate = InnovationGate()
     strange = np.array([S, np.full((2, 2), np.nan), -S])
     for k in range(300):
-        kept = gate.passed(k / 60, bearings(residuals(0.0, 0.0, 1.0), ALL), strange)
+        kept = gate.passed(k / 60, judgement_of(residuals(0.0, 0.0, 1.0), strange, ALL))
     assert kept.tolist() == [True, False, False]
 
 
@@ -216,7 +215,7 @@ def test_a_lost_pose_opens_the_gate_and_one_wrong_bearing_of_two_does_not() -> N
 
 def test_a_wide_prior_has_nothing_to_refuse_with() -> None:
     gate, wide = InnovationGate(), np.tile(np.eye(2), (3, 1, 1))
-    assert gate.passed(0.1, bearings(100.0 * residuals(5.0, 5.0, 5.0), np.zeros(3, bool)), wide).all()
+    assert gate.passed(0.1, judgement_of(100.0 * residuals(5.0, 5.0, 5.0), wide, np.zeros(3, bool))).all()
 
 
 def swapped(ticks: int, at: int) -> Recording:

@@ -16,11 +16,13 @@ from coopenv.estimation.compiled import adjoint
 from coopenv.observers import Coordinates, Run, SensorNoise, Tick, run
 from coopenv.observers.correction import gain, joseph
 from coopenv.observers.covariance_intersection import CovarianceIntersection, best_split_weight, best_weight
-from coopenv.observers.frame import UsableMeasurements, linearise
+from coopenv.observers.frame import UsableMeasurements
+from coopenv.observers.linearisation import linearise
 from coopenv.observers.registry import find
 from coopenv.observers.uncertain_pose import LEFT, RIGHT, UncertainPose
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
+from tests.helpers.readings import frame_of_bearings
 from tests.helpers.recordings import completed
 from tests.oracles.batch import assert_same_covariance, small_record, small_solution
 
@@ -72,13 +74,13 @@ def test_bearing_jacobian_is_the_derivative_of_the_predicted_bearing(coordinates
     z = np.random.default_rng(2).uniform(-8, 8, (4, 3))
     d = (z - state.p) @ state.R - c
     bearings = d / np.linalg.norm(d, axis=1, keepdims=True)
-    right, no = coordinates is Coordinates.RIGHT, np.zeros((4, 3, 3))
+    right, frame = coordinates is Coordinates.RIGHT, frame_of_bearings(c, bearings, z, 1.0)
 
     def residual(dx: np.ndarray) -> np.ndarray:
         moved = state.moved(dx, state.P)
-        return linearise(moved.R, moved.p, right, c, bearings, z, no, 1.0)[0]
+        return linearise(moved.R, moved.p, right, frame)[0]
 
-    H = linearise(state.R, state.p, right, c, bearings, z, no, 1.0)[1]
+    H = linearise(state.R, state.p, right, frame)[1]
     numeric = -derivative(residual, h=1e-6)
     # the tangent basis turns with the estimate, which a zero residual does not feel
     assert_allclose(H, numeric, atol=1e-7)
@@ -241,13 +243,15 @@ def test_covariance_intersection_of_one_bearing_is_the_best_of_all_weights() -> 
     heard = replace(made.tick(1, 1, {}), noise=noise)
     d = (z - fused.state.p) @ fused.state.R - heard.lever_arm
     b = d / np.linalg.norm(d)
-    _, (H,), _, (G,), _ = linearise(fused.state.R, fused.state.p, False, heard.lever_arm, b, z, C[None], 1e-4)
+    frame = frame_of_bearings(heard.lever_arm, b, z, 1e-4, C)
+    _, (H,), _, (by_target,), *_ = linearise(fused.state.R, fused.state.p, False, frame)
+    G = by_target[:, 3:]
 
     def log_determinant(w: float) -> float:
         N = 1e-4 * np.eye(2) + G @ C @ G.T / (1 - w)
         return -np.linalg.slogdet(w * np.linalg.inv(P) + H.T @ np.linalg.inv(N) @ H)[1]
 
-    fused.fuse_neighbour(heard, UsableMeasurements(b, z, C[None], np.array([3]), (None,)))
+    fused.fuse_neighbour(UsableMeasurements(*frame, np.array([None]), heard))
     best = min(log_determinant(w) for w in np.linspace(0.001, 0.999, 999))
     assert_allclose(np.linalg.slogdet(fused.state.P)[1], best, atol=0.02)
     assert best < np.linalg.slogdet(P)[1] - 0.05

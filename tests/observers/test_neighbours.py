@@ -12,11 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.poses import right_jacobian
 from coopenv.observers import Message, Received, Recording, run
-from coopenv.observers.frame import linearise
+from coopenv.observers.correction import NO_CONSTANTS
+from coopenv.observers.frame import Frame
+from coopenv.observers.linearisation import linearise
 from coopenv.observers.schmidt_kalman import Pairwise, SchmidtKalman
 from coopenv.observers.schmidt_kalman import considered as update
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
+from tests.helpers.readings import frame_of_bearings
 from tests.helpers.recordings import Tampering, completed
 from tests.observers.test_filters import derivative, pose, spd
 from tests.oracles.batch import assert_same_covariance, small_record
@@ -123,31 +126,31 @@ def test_lost_messages_are_bridged() -> None:
 
 
 def own_update(
-    R: np.ndarray, p: np.ndarray, joint: np.ndarray, frame: tuple, turn: np.ndarray
+    R: np.ndarray, p: np.ndarray, joint: np.ndarray, frame: Frame, variance: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return orientation, position, joint covariance and NIS of two bearings, the second one to a neighbour."""
 
     def look(theta: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         there = R @ Rotation.from_rotvec(theta).as_matrix(), p + R @ rho
-        residual, own, _, G, _ = linearise(*there, False, *frame)
+        residual, own, _, by_target, *_ = linearise(*there, False, frame)
         H = np.zeros((4, 12))
-        H[:, :6], H[2:, 9:] = own.reshape(4, 6), G[1] @ turn
+        H[:, :6], H[2:, 9:] = own.reshape(4, 6), by_target[1, :, 3:]
         H[:, :6] = H[:, :6] @ block_diag(right_jacobian(theta), Rotation.from_rotvec(-theta).as_matrix())
         return residual.ravel(), H
 
     def solved(r: np.ndarray, H: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        S = H @ joint @ H.T + frame[4] * np.eye(4)
+        S = H @ joint @ H.T + variance * np.eye(4)
         K = joint @ H.T @ np.linalg.inv(S)
         K[6:] = 0.0
         return K, K @ (r + H @ at)
 
     r, H = look(np.zeros(3), np.zeros(3))
-    nis = r @ np.linalg.solve(H @ joint @ H.T + frame[4] * np.eye(4), r)
+    nis = r @ np.linalg.solve(H @ joint @ H.T + variance * np.eye(4), r)
     at = 0.5 * solved(r, H, np.zeros(12))[1]
     r, H = look(at[:3], at[3:6])
     K, dx = solved(r, H, at)
     A = np.eye(12) - K @ H
-    after = A @ joint @ A.T + frame[4] * K @ K.T
+    after = A @ joint @ A.T + variance * K @ K.T
     turned = Rotation.from_rotvec(dx[:3]).as_matrix()
     moved = block_diag(right_jacobian(dx[:3]), turned.T, np.eye(6))
     return R @ turned, p + R @ dx[3:6], moved @ after @ moved.T, nis
@@ -162,14 +165,15 @@ def test_neighbours_that_are_considered_are_not_corrected(miss: float) -> None:
     d = (z - p) @ R
     bearings = d / np.linalg.norm(d, axis=1, keepdims=True) + miss * rng.normal(size=(2, 3))
     bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
-    frame = (np.zeros(3), bearings, z, np.zeros((2, 3, 3)), variance)
-    found = update(R, p, joint, frame, turn[None], np.array([-1, 0]))
-    R_after, p_after, after, nis = own_update(R, p, joint, frame, turn)
+    frame = frame_of_bearings(np.zeros(3), bearings, z, variance)
+    frame[0]["rotation"][1] = turn
+    found = update(R, p, joint, frame, NO_CONSTANTS, np.array([-1, 0]))
+    R_after, p_after, after, nis = own_update(R, p, joint, frame, variance)
     assert_allclose(found[0], R_after, atol=1e-12)
     assert_allclose(found[1], p_after, atol=1e-12)
     assert_allclose(found[2], after[:6, :6], atol=1e-12)
-    assert_allclose(found[4][0], after[:6, 6:], atol=1e-12)
-    assert_allclose(found[5], nis, rtol=1e-9, atol=1e-12)
+    assert_allclose(found[5][0], after[:6, 6:], atol=1e-12)
+    assert_allclose(found[6], nis, rtol=1e-9, atol=1e-12)
     if miss > 0.0:
         assert np.linalg.norm(p_after - p) > 0.01
     else:

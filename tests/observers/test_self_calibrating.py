@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from coopenv.mrclam.in_space import FLOOR_PERIOD_TICKS, RANGE_STD, RANGE_STD_BY_DISTANCE, spatial_recording_of
 from coopenv.observers import Recording, Tick, run
 from coopenv.observers.contract import SensorNoise
-from coopenv.observers.frame import linearised, usable_measurements
+from coopenv.observers.correction import NO_PLACES, looked
+from coopenv.observers.frame import usable_measurements
 from coopenv.observers.lasting_errors import LastingErrors
 from coopenv.observers.self_calibrating import SelfCalibrating
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose
@@ -81,19 +82,24 @@ def test_a_turned_camera_moves_bearings_as_its_derivative_says() -> None:
     measured = usable_measurements(tick)
     assert measured is not None and len(measured.targets) > 1
 
-    def residual(turn: np.ndarray) -> np.ndarray:
-        turned = measured.bearings @ Rotation.from_rotvec(turn).as_matrix()
-        return linearised(pose, tick, measured._replace(bearings=turned)).residual.ravel()
+    def seen(bearings: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals and derivatives of bearings, given the camera's turn."""
+        entries = measured.entries.copy()
+        entries["value"][:, :3] = bearings
+        frame, constants = measured._replace(entries=entries).frame, (lasting.by_pose(tick.lever_arm), values)
+        residual, H, _ = looked(LEFT, pose.R, pose.p, np.zeros(9), frame, constants, NO_PLACES)
+        return residual, H
 
-    at_lever_arm = lasting.on_bearings(linearised(pose, tick, measured), tick, measured, np.zeros(3))
-    columns = at_lever_arm.H[..., 6:].reshape(-1, 3)
+    def residual(turn: np.ndarray) -> np.ndarray:
+        return seen(rays @ Rotation.from_rotvec(turn).as_matrix(), np.zeros(3))[0]
+
     predicted = UncertainPose(LEFT, pose.R, pose.p, pose.P)
     directions = measured.positions - predicted.p - predicted.R @ tick.lever_arm
     rays = (directions @ predicted.R) / np.linalg.norm(directions, axis=1)[:, None]
-    measured = measured._replace(bearings=rays)  # as predicted, where the tangent planes are
+    columns = seen(rays, np.zeros(3))[1][:, 6:]  # as predicted, where the tangent planes are
     np.testing.assert_allclose(columns, derivative(residual, 3), atol=1e-6)
-    explained = lasting.on_bearings(linearised(pose, tick, measured), tick, measured, np.array([1e-4, 2e-4, -1e-4]))
-    np.testing.assert_allclose(explained.residual.ravel(), -columns @ [1e-4, 2e-4, -1e-4], atol=1e-9)
+    explained, _ = seen(rays, np.array([1e-4, 2e-4, -1e-4]))
+    np.testing.assert_allclose(explained, -columns @ [1e-4, 2e-4, -1e-4], atol=1e-9)
 
 
 def test_without_lasting_errors_it_is_the_schmidt_filter() -> None:

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.observers import Message, Received, Recording, Tick
 from coopenv.observers.centralised import Centralised, FirstEstimatesEkf, ObservabilityConstrainedEkf
-from coopenv.observers.frame import LinearMeasurements
+from coopenv.observers.frame import UsableMeasurements
+from coopenv.observers.linearisation import LinearMeasurements
 from coopenv.observers.pose_filters import PerspectivePoints
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose
 from coopenv.runs.recorder import record
@@ -166,8 +167,8 @@ def unobservable_dimension(kind: type[Centralised], made: Recording) -> int:
             super().correct(ticks, seen)
             rows.extend(H @ whole for H in self.used[-len(seen) :])
 
-        def linearise(self, i: int, tick: Tick, mask: np.ndarray) -> LinearMeasurements:
-            linear = super().linearise(i, tick, mask)
+        def linearise(self, i: int, measured: UsableMeasurements) -> LinearMeasurements:
+            linear = super().linearise(i, measured)
             self.used.append(linear.H.reshape(-1, linear.H.shape[-1]))
             return linear
 
@@ -196,7 +197,7 @@ def test_first_estimates_are_the_filter_in_transformed_coordinates() -> None:
         def reset(self, poses, covariances) -> None:  # type: ignore[no-untyped-def]
             super().reset(poses, covariances)
             for gate in self.gates:
-                gate.passed = lambda time, linear, S: np.ones(len(linear.residual), bool)  # type: ignore[method-assign]
+                gate.passed = lambda time, judgement: np.ones(len(judgement[0]), bool)  # type: ignore[method-assign]
 
     R, p = made.start_rotation.copy(), made.start_position.copy()
     axes = block_diag(*[block_diag(x, x) for x in R])
