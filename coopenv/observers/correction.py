@@ -92,7 +92,8 @@ def look_from(state: UncertainPose, measured: UsableMeasurements) -> Look:
     """Return measurements as a function of the own error about a predicted pose."""
 
     def look(at: Array) -> Stacked:
-        seen: Stacked = looked(state.kind, state.R, state.p, at, measured.frame, NO_CONSTANTS, NO_PLACES)
+        pose, recentred = state.moved(at, state.P), recentring(state.kind, at)
+        seen: Stacked = looked(*pose[:3], recentred, at, measured.frame, NO_CONSTANTS, NO_PLACES)
         return seen
 
     return look
@@ -242,20 +243,21 @@ def joint_jacobian(
     return whole
 
 
-@compiled(WHOLE, MATRIX, VECTOR, VECTOR, FRAME, CONSTANTS, PLACES)
-def looked(kind: int, R: Array, p: Array, at: Array, frame: Frame, constants: Constants, places: Any) -> Stacked:
-    """Return residual (k,), H (k, n) and N (k, k), linearised at a predicted pose that is moved by errors (n,).
+@compiled(WHOLE, MATRIX, VECTOR, MATRIX, VECTOR, FRAME, CONSTANTS, PLACES)
+def looked(
+    kind: int, R: Array, p: Array, recentring: Array, at: Array, frame: Frame, constants: Constants, places: Any
+) -> Stacked:
+    """Return residual (k,), H (k, n) and N (k, k), linearised at a pose that a prediction is moved to by errors (n,).
 
-    The poses of neighbours stay as they are. Arguments are those of `halfway_gain`.
+    H is the derivative by the errors about the prediction; `recentring` (6, 6) is theirs. The poses of neighbours stay
+    as they are. The other arguments are those of `halfway_gain`.
     """
     by_pose, values = constants
     own = 6 + len(values)
-    R, p = moved(kind, R, p, at[:6])
     residual, H, N, by_target, _, used, _, _ = linearise(R, p, kind == RIGHT, frame)
     moved_constants = by_pose, values + at[6:own]
     neighbours = (len(at) - own) // 6
-    recentred = recentring(kind, at[:6])
-    whole = joint_jacobian(residual, H, by_target, frame, recentred, moved_constants, places, neighbours)
+    whole = joint_jacobian(residual, H, by_target, frame, recentring, moved_constants, places, neighbours)
     return stacked(residual, whole, N, by_target, used, frame)
 
 
@@ -277,11 +279,12 @@ def halfway_gain(
         places: see `joint_jacobian`.
     """
     at = np.zeros(len(P))
-    residual, H, N = looked(kind, R, p, at, frame, constants, places)
+    residual, H, N = looked(kind, R, p, np.eye(6), at, frame, constants, places)
     _, dx, nis = gain(P, H, N, residual)
     for n in range(6 + len(constants[1])):
         at[n] = 0.5 * dx[n]
-    residual, H, N = looked(kind, R, p, at, frame, constants, places)
+    R, p = moved(kind, R, p, at[:6])
+    residual, H, N = looked(kind, R, p, recentring(kind, at[:6]), at, frame, constants, places)
     K, dx, _ = gain(P, H, N, residual + transformed(H, at))
     return K, H, N, dx, nis
 

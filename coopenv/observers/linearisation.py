@@ -201,14 +201,14 @@ def add_place(right: bool, R: Array, j: Array, a: Array, z: Array, row: Array) -
         z: (3,) on the map, m.
         row: (6,) is changed.
     """
+    x, y, w = row[0], row[1], row[2]
     if right:
-        turn = transformed(R, row[:3])
         put_derivative(row, transformed(R, j), z, 1.0)
+        for i in range(3):
+            row[i] += R[i, 0] * x + R[i, 1] * y + R[i, 2] * w
     else:
-        turn = row[:3].copy()
         put_derivative(row, j, a, 1.0)
-    for i in range(3):
-        row[i] += turn[i]
+        row[0], row[1], row[2] = row[0] + x, row[1] + y, row[2] + w
 
 
 @compiled(TARGET, BLOCKS, BLOCKS, TARGET, types.Array(types.boolean, 2, "C"), FRAME)

@@ -282,10 +282,9 @@ class SchmidtKalman(ConsiderFilter):
 def sent_cross_covariance(message: Message, target: int) -> Array:
     """Return the sent cross-covariance (6, 6) of a sender with a target, zero if the message has none."""
     targets, cross = (np.asarray(message.extra.get(name, ())) for name in ("targets", "cross"))
-    if targets.ndim != 1 or cross.shape != (len(targets), 6, 6):
+    if targets.ndim != 1 or cross.shape != (len(targets), 6, 6) or target not in (numbers := targets.tolist()):
         return np.zeros((6, 6))
-    found = np.flatnonzero(targets == target)
-    return np.asarray(cross[found[0]]) if len(found) else np.zeros((6, 6))
+    return np.asarray(cross[numbers.index(target)])
 
 
 class Pairwise(ConsiderFilter):

@@ -238,7 +238,8 @@ def _sensing(write: Any) -> Any:
             forget_readings(state, world, vehicle, sensor)
         if model.carries[vehicle, sensor] == 0:
             return
-        clear_information(state, world, vehicle, sensor)
+        if tick % model.observer.gramian_stride == 0:
+            clear_information(state, world, vehicle, sensor)
         carry_errors(model, state, world, vehicle, sensor, tick)
         out = state.sensor_outage[world, vehicle, sensor] == 1 and model.sensing != IDEAL
         if out or model.sensing == BLIND or state.present[world, agent] == 0 or not is_due_at(own.ratio, tick):

@@ -87,7 +87,7 @@ def test_a_turned_camera_moves_bearings_as_its_derivative_says() -> None:
         entries = measured.entries.copy()
         entries["value"][:, :3] = bearings
         frame, constants = measured._replace(entries=entries).frame, (lasting.by_pose(tick.lever_arm), values)
-        residual, H, _ = looked(LEFT, pose.R, pose.p, np.zeros(9), frame, constants, NO_PLACES)
+        residual, H, _ = looked(LEFT, pose.R, pose.p, np.eye(6), np.zeros(9), frame, constants, NO_PLACES)
         return residual, H
 
     def residual(turn: np.ndarray) -> np.ndarray:
