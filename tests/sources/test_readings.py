@@ -127,7 +127,7 @@ def test_a_log_is_compared_and_recorded_again_with_the_class_that_its_user_names
     write_recording(record(described(sensors=[{"kind": DOPPLER, "name": "radar"}])), path)
     monkeypatch.setattr(named, "_references", {})
     change = f"sensors.radar.kind={DOPPLER}"
-    with pytest.raises(CoopenvError, match="overrid.*is recorded"):
+    with pytest.raises(CoopenvError, match=r"overrid.*is recorded"):
         find_source(path, {"noise.enabled": False})
     assert main(["record", str(path), "--out", str(again), "--no-replay", "--set", change]) == 0
     monkeypatch.setattr(named, "_references", {})
