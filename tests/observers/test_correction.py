@@ -59,7 +59,7 @@ def test_the_update_by_a_linear_measurement_is_the_kalman_update() -> None:
     rng = np.random.default_rng(0)
     P, H, N, r = spd(rng, 6), rng.normal(size=(4, 6)), spd(rng, 4), rng.normal(size=4)
     look = lambda at: (r - H @ at, H, N)  # noqa: E731
-    for found, expected in zip(iterated(P, look, np.linalg.norm), kalman(P, H, N, r), strict=True):
+    for found, expected in zip(iterated(P, look, np.linalg.norm)[:3], kalman(P, H, N, r), strict=True):
         assert_allclose(found, expected, atol=1e-9)
 
 
@@ -74,7 +74,7 @@ def test_the_iterated_one_ends_at_the_most_probable_state() -> None:
         d = np.array([1.0, 2.0]) - at
         return np.array([measured - angle(at)]), np.array([[d[1], -d[0]]]) / (d @ d), N
 
-    dx, _, _ = iterated(P, look, np.linalg.norm)
+    dx, *_ = iterated(P, look, np.linalg.norm)
     best = minimize(lambda x: x @ np.linalg.solve(P, x) + (measured - angle(x)) ** 2 / N[0, 0], [0.0, 0.0], tol=1e-12)
     assert_allclose(dx, best.x, atol=1e-3)
 
