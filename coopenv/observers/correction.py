@@ -201,7 +201,7 @@ Constants = tuple[Array, Array]
 """Constants of the camera behind the own pose in a state: the left error of the pose (6, c) that moves bearings as each
 of the constants does, and their values (c,)."""
 NO_CONSTANTS = np.zeros((6, 0)), np.zeros(0)
-NO_PLACES = np.zeros(0, np.int64)  # without neighbours
+NO_PLACES, NO_CROSSES = np.zeros(0, np.int64), np.zeros((0, 6, 6))  # without neighbours
 
 
 @compiled(TARGET, MATRICES, MATRICES, FRAME, MATRIX, CONSTANTS, PLACES, WHOLE)
@@ -289,16 +289,23 @@ def halfway_gain(
     return K, H, N, dx, nis
 
 
-@compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME, CONSTANTS, PLACES)
-def judged_frame(kind: int, R: Array, p: Array, P: Array, frame: Frame, constants: Constants, places: Any) -> Judgement:
-    """Return how measurements of a frame are judged at a prediction; arguments are those of `halfway_gain`."""
-    residual, H, N, by_target, variance, used, angle, ahead = linearise(R, p, kind == RIGHT, frame)
-    neighbours = (len(P) - 6 - len(constants[1])) // 6
-    whole = joint_jacobian(residual, H, by_target, frame, np.eye(6), constants, places, neighbours)
+@compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME, CONSTANTS, MATRICES, PLACES)
+def judged_frame(
+    kind: int, R: Array, p: Array, P: Array, frame: Frame, constants: Constants, crosses: Array, places: Any
+) -> Judgement:
+    """Return how measurements of a frame are judged at a prediction.
+
+    P (n, n) is the covariance of the own error and of constants, and `crosses` (k, n, 6) are its covariances with the
+    errors of some neighbours. The other arguments are those of `halfway_gain`.
+    """
+    residual, H, N, by_target, _, used, angle, ahead = linearise(R, p, kind == RIGHT, frame)
+    whole = joint_jacobian(residual, H, by_target, frame, np.eye(6), constants, np.zeros(0, np.int64), 0)
+    S = spread(whole, P, N)
     for n in range(len(places)):
-        if places[n] >= 0:  # P has the covariance of the neighbour
-            place(N[n], 0, 0, np.diag(variance[n]))
-    return judged(residual, spread(whole, P, N), used, angle, ahead)
+        if places[n] >= 0:
+            common = product(product(whole[n], crosses[places[n]]), by_target[n].T)
+            place(S[n], 0, 0, S[n] + common + common.T)
+    return judged(residual, S, used, angle, ahead)
 
 
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)

@@ -99,11 +99,7 @@ class CovarianceIntersection(Mekf):
     def fuse_neighbour(self, one: UsableMeasurements) -> None:
         """Fuse one measurement of a neighbour with the covariance of its position."""
         state, linear = self.state, linearised(self.state, one)
-        H, N, own = linear.H[0], linear.N[0], np.diag(linear.variance[0])
-        if len(N) == 2:
-            w = best_weight(congruent(H, state.P), own, N - own) if N[0, 0] + N[1, 1] < VAGUE else 1.0
-        else:
-            w = best_split_weight(state.P, np.zeros((6, 6)), H, N, own)
+        w = weight(state.P, linear.H[0], linear.N[0], linear.variance[0])
         if w < 1.0:
             self.state = state._replace(P=state.P / w)
             self.fuse(one.inflated(1.0 / (1.0 - w)))
@@ -156,6 +152,15 @@ def best_split_weight(P_d: Array, P_i: Array, H: Array, N: Array, R_i: Array) ->
         if cost < least:
             best, least = w, cost
     return best
+
+
+@compiled(MATRIX, MATRIX, MATRIX, VECTOR)
+def weight(P: Array, H: Array, N: Array, variances: Array) -> float:
+    """Return w for one measurement, whose own noise has variances; 1 if the neighbour is too uncertain."""
+    own = np.diag(variances)
+    if len(N) == 2:
+        return best_weight(congruent(H, P), own, N - own) if N[0, 0] + N[1, 1] < VAGUE else 1.0
+    return best_split_weight(P, np.zeros((6, 6)), H, N, own)
 
 
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, MATRIX, FRAME)

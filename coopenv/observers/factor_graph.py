@@ -17,7 +17,7 @@ import numpy as np
 from coopenv.estimation.compiled import adjoint
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Estimate, Setup, Tick
-from coopenv.observers.correction import NO_CONSTANTS, NO_PLACES, InnovationGate, judged_frame
+from coopenv.observers.correction import NO_CONSTANTS, NO_CROSSES, NO_PLACES, InnovationGate, judged_frame
 from coopenv.observers.frame import usable_measurements
 from coopenv.observers.pose_filters import PoseObserver, unit
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose
@@ -105,7 +105,7 @@ class FactorGraph(PoseObserver):
         usable, R, p = usable_measurements(tick), self.state.R, self.state.p
         if usable is None or not len((measured := usable.of_camera()).entries):
             return
-        judgement = judged_frame(*self.state, measured.frame, NO_CONSTANTS, NO_PLACES)
+        judgement = judged_frame(*self.state, measured.frame, NO_CONSTANTS, NO_CROSSES, NO_PLACES)
         measured = measured.only(self.gate.passed(tick.time, judgement))
         for n, target in enumerate(measured.targets.tolist()):
             position = measured.positions[n]

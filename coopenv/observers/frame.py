@@ -138,6 +138,7 @@ def usable_measurements(tick: Tick, weighed: bool = True) -> UsableMeasurements 
         entries["sensor"][n], targets[n], values[n, : len(value)] = number, target, value
         if message is not None:
             messages[n], positions[n] = message, message.position
+            entries["rotation"][n] = np.nan
             _put_report(entries, n, message)
             velocity = np.asarray(message.extra.get("velocity", np.nan), float)
             entries["velocity"][n] = velocity if velocity.shape == (3,) else np.nan
@@ -158,7 +159,7 @@ def _other_measurements(tick: Tick) -> Iterator[tuple[int, int, Array, Message |
     landmarks = len(tick.landmarks)
     for number, (sensor, values, _) in enumerate(tick.readings, CAMERA + 1):
         targets = sensor.targets.tolist()
-        for n in np.isfinite(values).all(axis=-1).nonzero()[0].tolist():
+        for n in np.flatnonzero(np.isfinite(values).all(axis=-1)).tolist():
             target, message = targets[n], None
             if target >= landmarks:
                 received = tick.messages.get(target)
@@ -169,9 +170,10 @@ def _other_measurements(tick: Tick) -> Iterator[tuple[int, int, Array, Message |
 
 
 def _put_report(entries: NDArray[Any], n: int, message: Message) -> None:
-    """Write orientation and covariance of a target as reported; the orientation is NaN if it is not known."""
+    """Write orientation and covariance of a target as far as they are reported."""
     R, P = message.rotation, message.covariance
-    entries["rotation"][n] = np.nan if R is None else R
+    if R is not None:
+        entries["rotation"][n] = R
     if P is None:
         return
     if len(P) == 6 and R is not None:

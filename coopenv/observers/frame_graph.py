@@ -40,6 +40,7 @@ from coopenv.observers.correction import (
     LARGEST,
     LARGEST_OF,
     NO_CONSTANTS,
+    NO_CROSSES,
     NO_PLACES,
     PLACES,
     InnovationGate,
@@ -245,7 +246,7 @@ class GraphEstimator(ABC):
         if (measured := usable_measurements(reported)) is None:
             return
         pose = UncertainPose(LEFT, graph.R[k, vehicle], graph.p[k, vehicle], self.P[vehicle])
-        judgement = judged_frame(*pose, measured.frame, NO_CONSTANTS, NO_PLACES)
+        judgement = judged_frame(*pose, measured.frame, NO_CONSTANTS, NO_CROSSES, NO_PLACES)
         kept = self.gates[vehicle].passed(tick.time, judgement)
         bearings = measured.only(kept).of_camera()
         graph.add(vehicle, bearings.targets, bearings.bearings, bearings.positions)

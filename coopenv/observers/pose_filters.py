@@ -17,6 +17,7 @@ from coopenv.estimation.poses import Array, cholesky, lengths, solve
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.correction import (
     NO_CONSTANTS,
+    NO_CROSSES,
     NO_PLACES,
     InnovationGate,
     Judgement,
@@ -107,7 +108,7 @@ class Mekf(PoseObserver):
 
     def judged(self, measured: UsableMeasurements) -> Judgement:
         """Return how measurements are judged at the estimate."""
-        judgement: Judgement = judged_frame(*self.state, measured.frame, NO_CONSTANTS, NO_PLACES)
+        judgement: Judgement = judged_frame(*self.state, measured.frame, NO_CONSTANTS, NO_CROSSES, NO_PLACES)
         return judgement
 
     def correct(self, measured: UsableMeasurements) -> None:

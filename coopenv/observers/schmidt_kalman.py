@@ -124,8 +124,9 @@ class ConsiderFilter(Mekf):
     def judged(self, measured: UsableMeasurements) -> Judgement:
         """Return how measurements are judged at the estimate, cross-covariances included."""
         seen, places = self.places(measured)
-        joint = self.joint_covariance(seen)
-        judgement: Judgement = judged_frame(*self.state[:3], joint, measured.frame, self.constants, places)
+        crosses = np.array([self.neighbours[t].cross for t in seen]).reshape(-1, len(self.covariance), 6)
+        pose, frame = self.state[:3], measured.frame
+        judgement: Judgement = judged_frame(*pose, self.covariance, frame, self.constants, crosses, places)
         return judgement
 
     def receive(self, target: int, message: Message) -> None:
