@@ -7,6 +7,7 @@ the least of many rounds in turn, because other programs disturb single ones.
 
 import argparse
 from collections.abc import Callable
+from functools import partial
 from time import thread_time
 from typing import Any
 
@@ -43,7 +44,7 @@ def kernel_costs(rounds: int) -> dict[str, float]:
     for name, sensors in {"camera": [], **{kind: SETS[kind] for kind in KINDS}}.items():
         worlds[name] = Setting(DEAD_RECKONING).world(ENVIRONMENT, SENSED | {"sensors": sensors}, WORLDS, "float32")
     steps = {name: stepper(world, WARM_UP) for name, world in worlds.items()}
-    times = least({name: (lambda step=step: step(2)) for name, step in steps.items()}, rounds)
+    times = least({name: partial(step, 2) for name, step in steps.items()}, rounds)
     costs = {}
     for name, world in worlds.items():
         ticks = world.view("bearing_tick" if name == "camera" else "reading_tick") if name else np.zeros(1)

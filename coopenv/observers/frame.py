@@ -59,7 +59,7 @@ ENTRY = np.dtype(
 RECORDS = {dtype: types.Array(numba.from_dtype(dtype), 1, "A", readonly=True) for dtype in (ENTRY, SENSOR)}
 FRAME = types.Tuple((RECORDS[ENTRY], RECORDS[SENSOR], NUMBER, WHOLE))
 """The first fields of `UsableMeasurements`, for compiled functions."""
-Frame = tuple[NDArray[Any], NDArray[Any], float, int]
+Frame = tuple[Any, Any, float, int]
 
 ticks_of_own_kinds: WeakValueDictionary[int, Tick] = WeakValueDictionary()
 """Ticks with measurements of kinds that are not compiled, by `UsableMeasurements.own`."""

@@ -70,7 +70,7 @@ class LinearMeasurements(NamedTuple):
     def only(self, kept: NDArray[np.bool_]) -> "LinearMeasurements":
         """Return the measurements of a mask (m,)."""
         arrays: tuple[NDArray[Any], ...] = self[:-1]
-        return LinearMeasurements(*(array[kept] for array in arrays), self.measured.only(kept))
+        return LinearMeasurements._make([*(array[kept] for array in arrays), self.measured.only(kept)])
 
     def stacked(self) -> tuple[Array, Array, Array]:
         """Return residual (k,), H (k, n) and N (k, k) of the rows that were measured."""
