@@ -207,6 +207,7 @@ def vehicle_mark(index: int) -> str:
 
 
 _REACH = 0.4  # of the picture's side: how far a field of view is drawn of a camera that sees farther
+_CROSS = 0.012 * np.array([(1.0, 1.0, 0.0), (1.0, -1.0, 0.0)])  # of the side, halves of the diagonals of a cross
 _STAND_IN = 0.042  # of the scene's side, length of a vehicle without a body
 _CAR = (4.4, 1.9, 1.5)  # proportions of a vehicle without a body
 
@@ -288,19 +289,25 @@ class Stage:
         return np.asarray(frame.target_position + (frame.target_rotation @ self.marker[..., None])[..., 0])
 
     def reading_lines(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-        """Return the vehicles (m,) of measurements by sensors beside the camera, and lines (m, 2, 3) to their targets.
+        """Return the vehicles (m,) of measurements by sensors beside the camera, and lines (m, 2, 3) that show them.
 
-        A measurement is shown until the next one of the sensor is due.
+        A line leads to the target; two diagonals are a cross on a sensor that measures its place in the scene. Both are
+        shown until the next measurement of the sensor is due.
         """
         vehicles, lines = [np.empty(0, int)], [np.empty((0, 2, 3))]
         ticks, rate, targets = frame.reading_tick, self.scenario.rates.camera, self.targets(frame)
         for d, section in enumerate(self.scenario.sensors if ticks is not None else ()):
-            if ticks is not None and section.made.drawn == "line" and section.made.has_target:
+            kind, locates = section.made, section.white.max() < self.side
+            shown = kind.has_target if kind.drawn == "line" else kind.drawn == "cross" and locates
+            if ticks is not None and shown:
                 since, period = frame.tick - ticks[:, d], max(1.0, rate / (section.rate or rate))
                 i, target = np.nonzero((ticks[:, d] >= 0) & (since < period))
                 start = frame.position[i] + frame.rotation[i] @ np.array(section.position)
-                vehicles.append(i)
-                lines.append(np.stack([start, targets[target]], axis=1))
+                ends = [(start, targets[target])]
+                if kind.drawn == "cross":
+                    ends = [(start - way, start + way) for way in _CROSS * self.side]
+                vehicles += [i] * len(ends)
+                lines += [np.stack(pair, axis=1) for pair in ends]
         return np.concatenate(vehicles), np.concatenate(lines)
 
     def fields_of_view(self, frame: Frame, every: int = 1, of: slice = _ALL) -> np.ndarray | None:

@@ -312,6 +312,8 @@ class View3d:
         self._draw_lines(
             "sight of vehicles", ends[cars], observer[cars], 4.0 if self._camera == "pair" else 1.5, opacity=0.8
         )
+        sensing, lines = self._stage.reading_lines(frame)
+        self._draw_lines("readings", lines[self._shown[sensing]], sensing[self._shown[sensing]], 1.5, opacity=0.8)
 
     def _draw_lines(self, name: str, segments: np.ndarray, vehicle: np.ndarray, width: float, **more: Any) -> None:
         """Draw line segments (K, 2, 3) of vehicles (K,) in their colours; segments with NaN are left out."""
