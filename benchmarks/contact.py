@@ -76,13 +76,14 @@ def errors(recording: Recording, observer: str) -> Array:
     return found.position_error
 
 
-def measure(environment: str, driver: str, seeds: Sequence[int]) -> dict[str, list[list[float]]]:
+def measure(environment: str, driver: str, seeds: Sequence[int], seconds: float) -> dict[str, list[list[float]]]:
     """Return root mean square errors (seeds, 2), m, of observers: without measurements of vehicles, and with them."""
     found: dict[str, list[list[float]]] = {name: [] for name in (*OBSERVERS, BOUND)}
+    scenario = load_scenario(environment, {"horizon": seconds})
     with Progress(Console(stderr=True), environment, total=len(seeds)) as progress:
         for done, seed in enumerate(seeds):
             progress.update(done)
-            made = record(environment, seed, driver)
+            made = record(scenario, seed, driver)
             counted = unaided(made, LOCATING[environment])
             for name, rows in found.items():
                 both = [errors(part, name) for part in (without_vehicles(made), made)]
@@ -137,12 +138,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("environment", metavar="ENV", help=" or ".join(LOCATING))
     parser.add_argument("--driver", default="keep_contact", help="agent that drives (default: keep_contact)")
     parser.add_argument("--worlds", type=at_least(2), default=10, help="held-out worlds (default: 10)")
+    parser.add_argument("--seconds", type=float, default=40.0, help="of an episode (default: 40)")
     parser.add_argument("--page", type=Path, help="folder of the environments' pages")
     asked = parser.parse_args(arguments)
     try:
         check_one_of("unknown environment", asked.environment, LOCATING)
         seeds = [EVALUATION_SEEDS[k] for k in range(asked.worlds)]
-        text = report(asked.environment, asked.driver, measure(asked.environment, asked.driver, seeds))
+        text = report(asked.environment, asked.driver, measure(asked.environment, asked.driver, seeds, asked.seconds))
     except (CoopenvError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

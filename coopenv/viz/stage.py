@@ -207,7 +207,7 @@ def vehicle_mark(index: int) -> str:
 
 
 _REACH = 0.4  # of the picture's side: how far a field of view is drawn of a camera that sees farther
-_CROSS = 0.012 * np.array([(1.0, 1.0, 0.0), (1.0, -1.0, 0.0)])  # of the side, halves of the diagonals of a cross
+_CROSS = 0.025 * np.insert(CORNERS, 2, 0, axis=1)  # of the side: ends of the arms of a cross
 _STAND_IN = 0.042  # of the scene's side, length of a vehicle without a body
 _CAR = (4.4, 1.9, 1.5)  # proportions of a vehicle without a body
 
@@ -291,7 +291,7 @@ class Stage:
     def reading_lines(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
         """Return the vehicles (m,) of measurements by sensors beside the camera, and lines (m, 2, 3) that show them.
 
-        A line leads to the target; two diagonals are a cross on a sensor that measures its place in the scene. Both are
+        A line leads to the target; four lines are a cross on a sensor that measures its place in the scene. Both are
         shown until the next measurement of the sensor is due.
         """
         vehicles, lines = [np.empty(0, int)], [np.empty((0, 2, 3))]
@@ -305,7 +305,7 @@ class Stage:
                 start = frame.position[i] + frame.rotation[i] @ np.array(section.position)
                 ends = [(start, targets[target])]
                 if kind.drawn == "cross":
-                    ends = [(start - way, start + way) for way in _CROSS * self.side]
+                    ends = [(start + arm, start) for arm in _CROSS * self.side]
                 vehicles += [i] * len(ends)
                 lines += [np.stack(pair, axis=1) for pair in ends]
         return np.concatenate(vehicles), np.concatenate(lines)

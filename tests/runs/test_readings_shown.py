@@ -51,18 +51,19 @@ def test_lines_go_from_the_sensor_to_measured_targets_until_the_next_measurement
 
 
 def test_a_measured_position_is_a_cross_on_its_sensor() -> None:
-    """Two diagonals of one size about the antenna, in plan, while there is a measurement."""
+    """Four arms of one size, in plan, from the antenna to the corners of a square, while there is a measurement."""
     frame = episode().frame(4)
     ticks = frame.reading_tick
     assert ticks is not None
     ticks[:, 0], ticks[1, 1] = -1, 1  # no ranges; the second vehicle has lost its satellites
     vehicles, lines = Stage(described()).reading_lines(replace(frame, reading_tick=ticks))
-    assert_array_equal(vehicles, [0, 2, 0, 2])
-    assert_allclose(lines.mean(axis=1), frame.position[vehicles])
-    first, second = (lines[:, 1] - lines[:, 0]).reshape(2, 2, 3)
-    assert_allclose((first * second).sum(axis=-1), 0.0, atol=1e-12)
-    assert_allclose(np.linalg.norm(first, axis=-1), np.linalg.norm(second, axis=-1))
-    assert (first[..., 2] == 0.0).all() and (np.abs(first[..., :2]) > 0.1).all()
+    assert_array_equal(vehicles, [0, 2] * 4)
+    assert_allclose(lines[:, 1], frame.position[vehicles])
+    arms = (lines[:, 0] - lines[:, 1]).reshape(4, 2, 3)
+    assert_allclose(np.abs(arms), np.broadcast_to(np.abs(arms[0, 0]), arms.shape))
+    assert_allclose(arms.sum(axis=0), 0.0, atol=1e-12)
+    assert_allclose(np.abs(arms[0, 0, :2]), arms.max())
+    assert (arms[..., 2] == 0.0).all() and arms.max() > 0.1
 
 
 def test_a_position_that_is_less_accurate_than_the_scene_is_large_has_no_cross() -> None:
