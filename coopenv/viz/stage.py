@@ -207,7 +207,6 @@ def vehicle_mark(index: int) -> str:
 
 
 _REACH = 0.4  # of the picture's side: how far a field of view is drawn of a camera that sees farther
-_CROSS = 0.025 * np.insert(CORNERS, 2, 0, axis=1)  # of the side: ends of the arms of a cross
 _STAND_IN = 0.042  # of the scene's side, length of a vehicle without a body
 _CAR = (4.4, 1.9, 1.5)  # proportions of a vehicle without a body
 
@@ -288,24 +287,23 @@ class Stage:
         """Return the points that cameras see, (A, 3)."""
         return np.asarray(frame.target_position + (frame.target_rotation @ self.marker[..., None])[..., 0])
 
-    def reading_lines(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    def reading_lines(self, frame: Frame, least: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """Return the vehicles (m,) of measurements by sensors beside the camera, and lines (m, 2, 3) that show them.
 
-        A line leads to the target; four lines are a cross on a sensor that measures its place in the scene. Both are
-        shown until the next measurement of the sensor is due.
+        A line to the target, or a cross on a sensor that measures its place, is shown until the next one is due.
+        A cross is as wide as the longest body, or `least` m.
         """
         vehicles, lines = [np.empty(0, int)], [np.empty((0, 2, 3))]
+        cross = max(least, self.bodies()[0].max()) / 2 * np.insert(CORNERS, 2, 0, axis=1)
         ticks, rate, targets = frame.reading_tick, self.scenario.rates.camera, self.targets(frame)
         for d, section in enumerate(self.scenario.sensors if ticks is not None else ()):
             kind, locates = section.made, section.white.max() < self.side
-            shown = kind.has_target if kind.drawn == "line" else kind.drawn == "cross" and locates
-            if ticks is not None and shown:
+            arms = cross if kind.drawn == "cross" and locates else ()
+            if ticks is not None and (len(arms) or (kind.drawn == "line" and kind.has_target)):
                 since, period = frame.tick - ticks[:, d], max(1.0, rate / (section.rate or rate))
                 i, target = np.nonzero((ticks[:, d] >= 0) & (since < period))
                 start = frame.position[i] + frame.rotation[i] @ np.array(section.position)
-                ends = [(start, targets[target])]
-                if kind.drawn == "cross":
-                    ends = [(start + arm, start) for arm in _CROSS * self.side]
+                ends = [(start + arm, start) for arm in arms] or [(start, targets[target])]
                 vehicles += [i] * len(ends)
                 lines += [np.stack(pair, axis=1) for pair in ends]
         return np.concatenate(vehicles), np.concatenate(lines)
