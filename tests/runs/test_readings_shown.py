@@ -16,6 +16,7 @@ from coopenv.runs.summary import facts
 from coopenv.scenario import Scenario
 from coopenv.viz.stage import Stage
 from coopenv.viz.topview import TopView
+from coopenv.viz.view3d import View3d
 from tests.helpers.builders import circling, scenario
 
 OTHERS = [["L1", "L2", "vehicle_2"], ["L1", "vehicle_1", "vehicle_3"], ["L3", "vehicle_1"]]
@@ -73,6 +74,13 @@ def test_a_position_that_is_less_accurate_than_the_scene_is_large_has_no_cross()
     frame = record_episode(blurred, seed=3).frame(4)
     assert frame.reading_tick is not None and (frame.reading_tick[:, 0, 0] == 4).all()
     assert len(Stage(blurred).reading_lines(frame)[0]) == 0
+
+
+def test_films_in_3d_show_measurements() -> None:
+    pytest.importorskip("pyvista", reason="needs the extra film3d")
+    view, frame = View3d(described(), (320, 240)), episode().frame(4)
+    with_lines = view.paint(frame).copy()
+    assert (with_lines != view.paint(replace(frame, reading_tick=None))).any()
 
 
 def test_scenes_keep_which_targets_were_measured(tmp_path: Path) -> None:
