@@ -36,7 +36,6 @@ from sitegen.environments.sensing import fingerprint
 
 LOCATING = {"underpass": ("position",), "warehouse": ("tags", "uwb")}
 """Sensors that measure the map or landmarks of an environment, apart from heights and headings."""
-OBSERVERS = ("robust", "schmidt_kalman")
 BOUND = "bound"
 DRIVERS = ("route_follower", "keep_contact")
 SILENT = 1.0
@@ -76,9 +75,11 @@ def errors(recording: Recording, observer: str) -> Array:
     return found.position_error
 
 
-def measure(environment: str, driver: str, seeds: Sequence[int], seconds: float) -> dict[str, list[list[float]]]:
+def measure(
+    environment: str, driver: str, observers: Sequence[str], seeds: Sequence[int], seconds: float
+) -> dict[str, list[list[float]]]:
     """Return root mean square errors (seeds, 2), m, of observers: without measurements of vehicles, and with them."""
-    found: dict[str, list[list[float]]] = {name: [] for name in (*OBSERVERS, BOUND)}
+    found: dict[str, list[list[float]]] = {name: [] for name in (*observers, BOUND)}
     scenario = load_scenario(environment, {"horizon": seconds})
     with Progress(Console(stderr=True), environment, total=len(seeds)) as progress:
         for done, seed in enumerate(seeds):
@@ -91,7 +92,7 @@ def measure(environment: str, driver: str, seeds: Sequence[int], seconds: float)
     return found
 
 
-def report(environment: str, driver: str, found: dict[str, list[list[float]]]) -> str:
+def report(environment: str, driver: str, seconds: float, found: dict[str, list[list[float]]]) -> str:
     """Return the tables in Markdown, with the command that gives them."""
     rows = []
     for name, values in found.items():
@@ -99,7 +100,8 @@ def report(environment: str, driver: str, found: dict[str, list[list[float]]]) -
         share = errors[:, 1] / errors[:, 0]
         rows.append([name, *(_with_error(column) for column in (*errors.T, share))])
     columns = ["observer", "without [m]", "with [m]", "with / without"]
-    worlds = len(rows and next(iter(found.values())))
+    worlds = len(found[BOUND])
+    command = f"python -m benchmarks.contact {environment} --worlds {worlds} --seconds {seconds:g}"
     return "\n\n".join(
         [
             "## What contact is worth",
@@ -109,7 +111,7 @@ def report(environment: str, driver: str, found: dict[str, list[list[float]]]) -
             markdown(columns, rows),
             "Position errors of all vehicles by the driver, with 95 % intervals:",
             drivers_table(environment),
-            f"```\npython -m benchmarks.contact {environment} --worlds {worlds}  # coopenv {version()}\n```",
+            f"```\n{command}  # coopenv {version()}\n```",
         ]
     )
 
@@ -136,6 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, and print the tables; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.contact", description=__doc__)
     parser.add_argument("environment", metavar="ENV", help=" or ".join(LOCATING))
+    parser.add_argument("--observers", default="robust", help="names with commas between (default: robust)")
     parser.add_argument("--driver", default="keep_contact", help="agent that drives (default: keep_contact)")
     parser.add_argument("--worlds", type=at_least(2), default=10, help="held-out worlds (default: 10)")
     parser.add_argument("--seconds", type=float, default=40.0, help="of an episode (default: 40)")
@@ -144,17 +147,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         check_one_of("unknown environment", asked.environment, LOCATING)
         seeds = [EVALUATION_SEEDS[k] for k in range(asked.worlds)]
-        text = report(asked.environment, asked.driver, measure(asked.environment, asked.driver, seeds, asked.seconds))
+        found = measure(asked.environment, asked.driver, asked.observers.split(","), seeds, asked.seconds)
+        text = report(asked.environment, asked.driver, asked.seconds, found)
     except (CoopenvError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print(text)
     if asked.page:
-        value = {
-            "coopenv": version(),
-            "worlds": asked.worlds,
-            "scenario": fingerprint(load_scenario(asked.environment)),
-        }
+        scene = fingerprint(load_scenario(asked.environment))
+        value = {"coopenv": version(), "worlds": asked.worlds, "scenario": scene}
         replace_text(asked.page / f"{asked.environment}.json", json_text({**value, "text": text}))
     return 0
 

@@ -109,7 +109,7 @@ class KeepContact(RouteFollower):
         super().__init__(scenario)
         others = range(len(scenario.landmarks), len(scenario.target_names))
         sensors = [s for s in scenario.sensors if any(s.measures(scenario, other) for other in others)]
-        ranges = [sensor.range for sensor in (*sensors, *scenario.cameras)]
+        ranges = [sensor.range for sensor in sensors] + [camera.range for camera in scenario.cameras]
         self.reach = min((reach for reach in ranges if reach is not None), default=np.inf)
         """Shortest range of any sensor of vehicles, m."""
 

@@ -40,6 +40,7 @@ def test_errors_count_after_a_second_without_a_measurement_of_the_map() -> None:
 
 
 def test_the_tables_name_observers_bound_and_drivers() -> None:
-    text = contact.report("underpass", "keep_contact", {"robust": [[0.4, 0.2], [0.6, 0.3]], "bound": [[0.3, 0.1]] * 2})
+    found = {"robust": [[0.4, 0.2], [0.6, 0.3]], "bound": [[0.3, 0.1]] * 2}
+    text = contact.report("underpass", "keep_contact", 40.0, found)
     assert "| robust | 0.5(1) | 0.25(5) |" in " ".join(text.split())
     assert "| bound |" in text and "| `route_follower` | 32 |" in " ".join(text.split())
