@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import coopenv
+from benchmarks.contact import measure
 from coopenv.api.engine import Engine
 from coopenv.bench.contest import Contest
 from coopenv.bench.evaluation import evaluated
@@ -54,6 +55,13 @@ def test_contact_pays(environment: str) -> None:
     contact, none = (figures(environment, agent) for agent in ("keep_contact", "route_follower"))
     assert contact["e95_m"][2] < none["e95_m"][1] and none["e95_m"][2] < 0.95 * LOST
     assert contact["arrival_rate"][0] == 1.0 and contact["collision_rate"][0] == 0.0
+
+
+def test_measurements_of_vehicles_localise_those_without_satellites() -> None:
+    found = measure("underpass", "keep_contact", ["robust"], [21, 22], 40.0)
+    for name, share in (("robust", 0.8), ("bound", 0.6)):
+        without, contact = np.mean(found[name], axis=0)
+        assert contact < share * without
 
 
 def standing(found: Mapping[str, tuple[float, float, float]]) -> tuple[float, float, float]:
