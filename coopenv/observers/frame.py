@@ -56,6 +56,7 @@ class OtherMeasurements(NamedTuple):
     rotation: Array  # (m, 3, 3) of the targets as known or reported, NaN where not
     velocity: Array  # (m, 3) likewise, map, m/s
     turns: Array  # (m, 6, 3) covariance of the pose, about own axes and in map axes, with the turn
+    curvature: Array  # (m, MOST_VALUES) variances of second-order errors of the rows
 
 
 class UsableMeasurements(NamedTuple):
@@ -167,7 +168,8 @@ def _other_measurements(tick: Tick, weighed: bool) -> Iterator[tuple[Any, ...]]:
                 rotation = np.eye(3) if tick.landmark_rotation is None else tick.landmark_rotation[target]
                 velocity = np.where(np.isfinite(rotation).all(), np.zeros(3), np.nan)
             padded = np.pad(values[n], (0, MOST_VALUES - len(values[n])), constant_values=np.nan)
-            yield target, position, C[3:, 3:], message, (number, padded, rotation, velocity, C[:, :3])
+            entries = number, padded, rotation, velocity, C[:, :3], np.zeros(MOST_VALUES)
+            yield target, position, C[3:, 3:], message, entries
 
 
 def _reported(message: Message, weighed: bool) -> tuple[Array, Array, Array, Array]:
@@ -189,7 +191,7 @@ def _joined(bearings: UsableMeasurements, others: list[tuple[Any, ...]]) -> Usab
     """Return the bearings of a camera followed by the measurements of other sensors."""
     targets, positions, covariances, messages, entries = zip(*others, strict=True)
     count, m = len(bearings.targets), len(bearings.targets) + len(others)
-    of_camera = CAMERA, np.full(MOST_VALUES, np.nan), np.eye(3), np.zeros(3), np.zeros((6, 3))
+    of_camera = CAMERA, np.full(MOST_VALUES, np.nan), np.eye(3), np.zeros(3), np.zeros((6, 3)), np.zeros(MOST_VALUES)
     parts = [np.array(part) for part in zip(*[of_camera] * count, *entries, strict=True)]
     named = np.empty(len(others), object)
     named[:] = messages
@@ -267,10 +269,11 @@ def _put(
     """Write the rows of one sensor; an uncertain pose of the target adds to the noise."""
     r = slice(0, found.residual.shape[1])
     by_own = found.by_own @ np.linalg.inv(adjoint(pose.R, pose.p)) if pose.kind == RIGHT else found.by_own
-    C = pose_covariances(measured)[rows]
+    assert measured.others is not None
+    C, variances = pose_covariances(measured)[rows], found.noise + measured.others.curvature[rows, r]
     linear.residual[rows, r], linear.H[rows, r], linear.used[rows, r] = found.residual, by_own, found.used  # type: ignore[index]
     linear.turn[rows, r], linear.G[rows, r] = found.by_target[..., :3], found.by_target[..., 3:]  # type: ignore[index]
-    diagonal = found.noise[..., None] * np.eye(found.noise.shape[1])
+    diagonal = variances[..., None] * np.eye(found.noise.shape[1])
     linear.N[rows, r, r] = diagonal + found.by_target @ C @ np.swapaxes(found.by_target, -1, -2)
 
 

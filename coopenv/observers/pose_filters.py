@@ -15,8 +15,17 @@ from numpy.typing import NDArray
 from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled, exp_so3, exp_translation, transformed
 from coopenv.estimation.poses import Array, cholesky, lengths, solve
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import InnovationGate, corrected_pose, iterated, look_from, turn_of_sight
+from coopenv.observers.correction import (
+    CURVATURE_TIME,
+    InnovationGate,
+    corrected_pose,
+    curvature,
+    iterated,
+    look_from,
+    turn_of_sight,
+)
 from coopenv.observers.frame import (
+    CAMERA,
     FRAME,
     Frame,
     LinearMeasurements,
@@ -79,6 +88,7 @@ class Mekf(PoseObserver):
         """Start at a pose."""
         super().reset(initial_pose, initial_covariance)
         self.gate = InnovationGate()
+        self.measured: dict[int, float] = {}  # s, time of the last measurement of each sensor beside the camera
 
     def update(self, tick: Tick) -> Estimate:
         """Predict, then correct by every usable bearing."""
@@ -97,6 +107,8 @@ class Mekf(PoseObserver):
 
     def take(self, tick: Tick, measured: UsableMeasurements) -> None:
         """Correct by the bearings that pass the gate."""
+        if measured.others is not None:
+            measured = self.with_curvature(tick, measured)
         if self.gated:
             linear = self.linearised(tick, measured)
             S = self.spread(measured, linear)
@@ -105,6 +117,24 @@ class Mekf(PoseObserver):
                 measured = measured.only(kept)
         if len(measured.targets):
             self.correct(tick, measured)
+
+    def with_curvature(self, tick: Tick, measured: UsableMeasurements) -> UsableMeasurements:
+        """Return the measurements with the variances of second-order errors of those of other sensors."""
+        others, frames = measured.others, np.zeros(len(measured.targets))
+        assert others is not None
+        for number in {*others.sensor.tolist()} - {CAMERA}:
+            passed = max(tick.time - self.measured.get(number, 0.0), tick.dt)
+            frames[others.sensor == number] = max(CURVATURE_TIME / passed, 1.0)
+            self.measured[number] = tick.time
+        linear, V = self.linearised(tick, measured), self.covariances_of_lines(measured)
+        found = curvature(linear, measured.positions - self.state.p, V, frames)
+        padded = np.zeros_like(others.curvature)
+        padded[:, : found.shape[1]] = found
+        return measured._replace(others=others._replace(curvature=padded))
+
+    def covariances_of_lines(self, measured: UsableMeasurements) -> Array:
+        """Return the covariances (m, 3, 3) of the lines to the targets, map, m^2."""
+        return self.state.point_covariance(np.zeros(3)) + measured.covariances
 
     def linearised(self, tick: Tick, measured: UsableMeasurements) -> LinearMeasurements:
         """Return the measurements linearised at the estimate."""
