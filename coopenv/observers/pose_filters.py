@@ -27,6 +27,7 @@ from coopenv.observers.correction import (
 from coopenv.observers.frame import (
     CAMERA,
     FRAME,
+    MOST_VALUES,
     Frame,
     LinearMeasurements,
     UsableMeasurements,
@@ -120,21 +121,18 @@ class Mekf(PoseObserver):
 
     def with_curvature(self, tick: Tick, measured: UsableMeasurements) -> UsableMeasurements:
         """Return the measurements with the variances of second-order errors of those of other sensors."""
-        others, frames = measured.others, np.zeros(len(measured.targets))
+        others, frames, linear = measured.others, np.zeros(len(measured.targets)), self.linearised(tick, measured)
         assert others is not None
         for number in {*others.sensor.tolist()} - {CAMERA}:
             passed = max(tick.time - self.measured.get(number, 0.0), tick.dt)
             frames[others.sensor == number] = max(CURVATURE_TIME / passed, 1.0)
             self.measured[number] = tick.time
-        linear, V = self.linearised(tick, measured), self.covariances_of_lines(measured)
-        found = curvature(linear, measured.positions - self.state.p, V, frames)
-        padded = np.zeros_like(others.curvature)
-        padded[:, : found.shape[1]] = found
+        H, along_axes = np.zeros((len(frames), 3, linear.H.shape[-1])), np.tile(np.eye(3), (len(frames), 1, 1))
+        H[..., :6] = -self.state.point_derivative(np.zeros(3))
+        lines = linear._replace(H=H, N=measured.covariances, G=along_axes, turn=None)
+        found = curvature(linear, measured.positions - self.state.p, self.spread(measured, lines), frames)
+        padded = np.pad(found, ((0, 0), (0, MOST_VALUES - found.shape[1])))
         return measured._replace(others=others._replace(curvature=padded))
-
-    def covariances_of_lines(self, measured: UsableMeasurements) -> Array:
-        """Return the covariances (m, 3, 3) of the lines to the targets, map, m^2."""
-        return self.state.point_covariance(np.zeros(3)) + measured.covariances
 
     def linearised(self, tick: Tick, measured: UsableMeasurements) -> LinearMeasurements:
         """Return the measurements linearised at the estimate."""

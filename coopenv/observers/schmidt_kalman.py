@@ -126,16 +126,6 @@ class ConsiderFilter(Mekf):
                 S[n] += common + common.T
         return S
 
-    def covariances_of_lines(self, measured: UsableMeasurements) -> Array:
-        """Return the covariances (m, 3, 3) of the lines to the targets, map, m^2, cross-covariances included."""
-        V = super().covariances_of_lines(measured)
-        for n, target in enumerate(measured.targets.tolist()):
-            if target in self.neighbours:
-                of = self.neighbours[target]
-                common = self.state.R.dot(of.cross[3:6, 3:]).dot(of.R.T)
-                V[n] -= common + common.T
-        return V
-
     def receive(self, target: int, message: Message) -> None:
         """Take the report of a neighbour, if it runs the same observer."""
         factor, number = (np.asarray(message.extra.get(name, np.nan)) for name in ("factor", "number"))
