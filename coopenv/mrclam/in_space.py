@@ -4,9 +4,11 @@ Five robots on a level floor (z = 0) among 15 landmarks. Ticks are 0.05 s apart;
 of any robot. A camera frame counts at the next tick; its bearings are turned by the odometry's rotation in between.
 All robots receive from all others: at tick k the last message of tick k - 1 or before.
 
-The camera's bearings are those of the recording; the ranges that it derives from the size of a barcode are readings of
-a sensor `range`. All measurements lie in the plane, so that by symmetry an estimate on the plane stays there. Two more
-sensors bound the variances of what the robots cannot do: `level` measures roll and pitch, `height` measures z.
+The camera's bearings are those of the recording. Its ranges are derived from the size of a barcode's image, which is in
+inverse proportion to the depth along the optical axis, and so the recorded ranges are depths; divided by the cosine of
+the bearing they are readings of a sensor `range`. All measurements lie in the plane, so that by symmetry an estimate on
+the plane stays there. Two more sensors bound the variances of what the robots cannot do: `level` measures roll and
+pitch, `height` measures z.
 
 Odometry is the commands, which a nominal calibration turns into motion. `SensorNoise` declares what the calibration of
 one robot may differ by, so that a filter can estimate it (`coopenv.observers.lasting_errors`).
@@ -21,16 +23,18 @@ from numpy.typing import NDArray
 
 from coopenv.estimation.poses import Array, about_z
 from coopenv.measurements.sensor import MAP, Sensor
-from coopenv.mrclam.dataset import ROBOTS, Dataset, HeldCommands, arc
+from coopenv.mrclam.dataset import ROBOTS, Dataset, HeldCommands, Robot, arc
 from coopenv.mrclam.recording import TICK_S, Variant, recording_of, seen_by, start_of
+from coopenv.mrclam.wheels import IROBOT_CREATE, TURNING_RATE
 from coopenv.observers.contract import SensorNoise
 from coopenv.observers.recording import Recording, check_recording
 
 # The next constants were tuned on sub-dataset 6 (docs/data.md).
-LEAD_S = 0.2  # by which commands are ahead of the motion
-TURN_SCALE, SPEED_SCALE = 0.93, 1.04  # motion over command
-STRAIGHT_RATE = 0.006  # rad/s, the commanded rate at which a robot drives straight
-TURNING_LOSS = 0.5  # s/rad, share of the speed that a robot loses per rate of turn
+LEAD_S = 0.15  # by which commands are ahead of the wheels' response
+TURN_SCALE = 0.936  # motion over the turn that the wheels' response gives
+STRAIGHT_RATE = 0.005  # rad/s, the commanded rate at which a robot drives straight
+TURNING_LOSS = 1.0  # s/rad, share of the speed that a robot loses per commanded rate of turn
+RANGE_SCALE, RANGE_OFFSET = 1.022, 0.045  # of recorded ranges over distances, and m
 NOISE = SensorNoise(
     velocity=0.002 / math.sqrt(TICK_S),
     angular_velocity=0.008 / math.sqrt(TICK_S),
@@ -46,9 +50,11 @@ NOISE = SensorNoise(
     angular_velocity_by=(0.1 / math.sqrt(TICK_S), 0.2 / math.sqrt(TICK_S)),
 )
 """Noise of all sub-datasets."""
-RANGE_STD, RANGE_STD_BY_DISTANCE = 0.1, 0.15
-"""m, and m per m. The errors of ranges have a standard deviation of 0.044 m per m, and those of two ranges to the same
-landmark within a second have a correlation of 0.95, by which they average as white noise of up to 0.27 m per m."""
+WHEELS = IROBOT_CREATE
+RANGE_STD, RANGE_STD_BY_DISTANCE = 0.03, 0.03
+"""m, and m per m. Without a robot's own scale and offset, errors of ranges have a standard deviation of 0.008 m per m
+(of robot 5: 0.016), and a correlation time of 6 s, by which at 2 Hz they average as white noise of 0.04 m per m."""
+RANGE_BIAS, RANGE_SCALE_STD = 0.05, 0.02  # m, and relative, by which robots differ
 FLOOR_STD = 0.01  # rad and m, of the level floor
 UNKNOWN_STD = 1e3  # rad and m, of what the floor does not show: heading, x and y
 FLOOR_PERIOD_TICKS = 40
@@ -74,13 +80,12 @@ def spatial_recording_of(dataset: Dataset, variant: Variant) -> Recording:
     R, position = plane.truth.rotation, plane.truth.position
     pose = np.concatenate([position[..., :2], np.arctan2(R[..., 1, 0], R[..., 0, 0])[..., None]], axis=-1)
     for i, robot in enumerate(dataset.robots):
-        held = HeldCommands(robot)
-        turn, path = _motion(held, plane.t)
+        turn, path = _motion(robot, plane.t)
         moved["velocity"][1:, i, 0], moved["angular_velocity"][1:, i, 2] = path / TICK_S, turn / TICK_S
         moved["translation"][1:, i, :2] = arc(np.zeros_like(turn), path, turn)
         rotation[1:, i] = about_z(turn)
-        k, seen, _, ranges = seen_by(robot, variant, held, plane.t)
-        readings["range"][k, i, column[seen], 0] = ranges
+        k, seen, _, ranges = seen_by(robot, variant, HeldCommands(robot), plane.t)
+        readings["range"][k, i, column[seen], 0] = (ranges - RANGE_OFFSET) / RANGE_SCALE
         start[i], _ = start_of(robot, _reckoned(turn, path), pose[:, i], plane.t)
     setups = tuple(replace(of, noise=NOISE, planar=False, sensors=_sensors(of.targets)) for of in plane.setups)
     recording = replace(
@@ -100,18 +105,29 @@ def _sensors(targets: NDArray[np.int64]) -> tuple[Sensor, ...]:
     """Return the sensors of a robot beside its camera, in the body's origin."""
     place = np.zeros(3), np.eye(3)
     floor, the_map = np.full(3, FLOOR_STD), np.array([MAP])
+    distance = Sensor("range", "range", np.array([RANGE_STD]), targets, *place)
     return (
-        Sensor("range", "range", np.array([RANGE_STD]), targets, *place, std_by_distance=RANGE_STD_BY_DISTANCE),
+        replace(distance, std_by_distance=RANGE_STD_BY_DISTANCE, bias=RANGE_BIAS, scale=RANGE_SCALE_STD),
         Sensor("level", "attitude", np.where([False, False, True], UNKNOWN_STD, floor), the_map, *place),
         Sensor("height", "position", np.where([True, True, False], UNKNOWN_STD, floor), the_map, *place),
     )
 
 
-def _motion(held: HeldCommands, t: Array) -> tuple[Array, Array]:
+def _nominal(robot: Robot) -> HeldCommands:
+    """Return the motion that a robot's commands lead to, before lead and delay."""
+    t, v, omega = robot.odometry.T
+    gain = np.array([WHEELS.gain(*command) for command in zip(v.tolist(), omega.tolist(), strict=True)])
+    turning = np.where(np.abs(omega) > TURNING_RATE, omega - STRAIGHT_RATE, 0.0)
+    moved = np.column_stack([t, v * (1.0 - TURNING_LOSS * np.abs(omega)), TURN_SCALE * gain * turning])
+    return HeldCommands(replace(robot, odometry=moved))
+
+
+def _motion(robot: Robot, t: Array) -> tuple[Array, Array]:
     """Return the turns (K - 1,) rad and paths (K - 1,) m between ticks, by the nominal calibration of commands."""
-    turn, path = np.diff(held.sums(t - LEAD_S), axis=0).T
-    straight = np.where(path == 0.0, 0.0, STRAIGHT_RATE * TICK_S)
-    return TURN_SCALE * (turn - straight), SPEED_SCALE * path * (1.0 - TURNING_LOSS * np.abs(turn) / TICK_S)
+    nominal = _nominal(robot)
+    sums = [share * nominal.sums(t - LEAD_S - delay) for delay, share in zip(WHEELS.delay, WHEELS.share, strict=True)]
+    turn, path = np.diff(sum(sums), axis=0).T
+    return turn, path
 
 
 def _reckoned(turn: Array, path: Array) -> Array:

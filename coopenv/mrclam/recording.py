@@ -135,14 +135,18 @@ def counted(robot: Robot, variant: Variant) -> NDArray[np.bool_]:
 def seen_by(
     robot: Robot, variant: Variant, held: HeldCommands, t: Array
 ) -> tuple[NDArray[Any], NDArray[Any], Array, Array]:
-    """Return of what one robot's camera saw the ticks, the subjects, unit vectors (n, 3), and ranges (n,) in m."""
-    time, who, distance, angle = robot.detections[counted(robot, variant)].T
+    """Return of what one robot's camera saw the ticks, the subjects, unit vectors (n, 3), and ranges (n,) in m.
+
+    A recorded range is a depth along the optical axis: it is derived from the height of a barcode's image.
+    """
+    time, who, depth, angle = robot.detections[counted(robot, variant)].T
     k = np.maximum(np.searchsorted(t, time), 1)
     inside = k < len(t)
     k = k[inside]
     beta = angle[inside] - (held.pose(t[k]) - held.pose(time[inside]))[:, 2]
     vectors = np.array([(math.cos(b), math.sin(b), 0.0) for b in beta.tolist()]).reshape(-1, 3)
-    return k, who[inside].astype(np.int64), vectors, distance[inside]
+    ahead = np.where(np.cos(angle) > 0.0, np.cos(angle), np.nan)
+    return k, who[inside].astype(np.int64), vectors, (depth / ahead)[inside]
 
 
 def _truth(robot: Robot, held: HeldCommands, t: Array) -> Array:

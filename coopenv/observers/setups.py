@@ -72,6 +72,7 @@ def sensors_of(scenario: Scenario, vehicle: int, neighbours: Sequence[int]) -> t
                 position=np.array(section.position),
                 rotation=section.mounting,
                 options=section.arguments,
+                bias=section.bias if scenario.noise.enabled else 0.0,
             )
         )
     return tuple(sensors)

@@ -85,14 +85,14 @@ def test_a_turned_camera_moves_bearings_as_its_derivative_says() -> None:
         turned = measured.bearings @ Rotation.from_rotvec(turn).as_matrix()
         return linearised(pose, tick, measured._replace(bearings=turned)).residual.ravel()
 
-    at_lever_arm = lasting.on_bearings(linearised(pose, tick, measured), tick, measured, np.zeros(3))
+    at_lever_arm = lasting.on_measurements(linearised(pose, tick, measured), tick, measured, np.zeros(3))
     columns = at_lever_arm.H[..., 6:].reshape(-1, 3)
     predicted = UncertainPose(LEFT, pose.R, pose.p, pose.P)
     directions = measured.positions - predicted.p - predicted.R @ tick.lever_arm
     rays = (directions @ predicted.R) / np.linalg.norm(directions, axis=1)[:, None]
     measured = measured._replace(bearings=rays)  # as predicted, where the tangent planes are
     np.testing.assert_allclose(columns, derivative(residual, 3), atol=1e-6)
-    explained = lasting.on_bearings(linearised(pose, tick, measured), tick, measured, np.array([1e-4, 2e-4, -1e-4]))
+    explained = lasting.on_measurements(linearised(pose, tick, measured), tick, measured, np.array([1e-4, 2e-4, -1e-4]))
     np.testing.assert_allclose(explained.residual.ravel(), -columns @ [1e-4, 2e-4, -1e-4], atol=1e-9)
 
 
