@@ -91,11 +91,9 @@ class SelfCalibrating(SchmidtKalman):
         recent = [*self.since.items()][1 - REMEMBERED :]
         self.since = {**dict(recent), self.number: by_pose.dot(self.from_marker)}
         numbers = np.array([self.neighbours[t].number for t in sorted(self.neighbours)], float)
-        made, self.corrections = self.corrections, {}
-        made = [
-            [target, number, *shift, *reduced.ravel()] for target, (number, shift, reduced) in self.corrections.items()
-        ]
-        extra = {"numbers": numbers, "corrections": np.array(rows, float).reshape(-1, 44)}
+        made = [[target, one[0], *one[1], *one[2].ravel()] for target, one in self.corrections.items()]
+        self.corrections = {}
+        extra = {"numbers": numbers, "corrections": np.array(made, float).reshape(-1, 44)}
         return Message(report.position, report.rotation, report.covariance, {**report.extra, **extra})
 
     @staticmethod

@@ -10,6 +10,7 @@ import numpy as np
 
 from coopenv.mrclam.dataset import MotionCapture, Robot
 from coopenv.mrclam.recording import Dataset, recording_of
+from coopenv.mrclam.wheels import IROBOT_CREATE
 from coopenv.observers.recording import Recording
 
 ORIGIN = 1248444187.0
@@ -38,8 +39,16 @@ def command(robot: int) -> tuple[float, float]:
 def calibrated_command(robot: int) -> tuple[float, float]:
     """Return the commanded v and omega that the nominal calibration turns into the motion."""
     v, omega = command(robot)
-    commanded = omega / 0.93 + 0.006
-    return v / 1.04 / (1.0 - 0.5 * abs(commanded)), commanded
+    commanded = v, omega
+    for _ in range(50):  # a contraction
+        turn = omega / 0.936 / IROBOT_CREATE.gain(*commanded) + 0.005
+        commanded = v / (1.0 - abs(turn)), turn
+    return commanded
+
+
+def recorded_range(distance: float, bearing: float) -> float:
+    """Return what the camera records as a range: a depth along its optical axis, with a nominal scale and offset."""
+    return (1.022 * distance + 0.045) * math.cos(bearing)
 
 
 def write(parent: Path, number: int = 6, seconds: float = 40.0, calibrated: bool = False) -> Path:
@@ -72,7 +81,8 @@ def _sightings(robot: int, seconds: float) -> list[str]:
             dx, dy = point - (x, y)
             bearing = (np.arctan2(dy, dx) - heading + np.pi) % (2 * np.pi) - np.pi
             if abs(bearing) < 1.0:
-                row = f"{ORIGIN + time:.3f} \t {BARCODES[subject]:4d} \t {np.hypot(dx, dy):.8f} \t {bearing:.8f}"
+                depth = recorded_range(float(np.hypot(dx, dy)), bearing)
+                row = f"{ORIGIN + time:.3f} \t {BARCODES[subject]:4d} \t {depth:.8f} \t {bearing:.8f}"
                 rows.append(row)
     return rows
 
@@ -93,7 +103,7 @@ MISREAD = 0.004  # share of barcodes
 
 
 def barrier_robots(seed: int, seconds: float = 150.0, turn_scale: float = 0.6, barriers: int = 3) -> Dataset:
-    """Return a sub-dataset in which robots turn `turn_scale` times their commands."""
+    """Return a sub-dataset in which robots turn `turn_scale` times what their wheels make of commands."""
     rng = np.random.default_rng([9, seed])
     centre, angle = rng.uniform(LOW + 1, HIGH - 1, (barriers, 2)), rng.uniform(0, np.pi, barriers)
     half = rng.uniform(0.8, 1.6, barriers)[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -115,7 +125,8 @@ def _drive(rng: np.random.Generator, seconds: float, turn_scale: float) -> tuple
         t = k * DT
         if t >= until:
             command, until = _command(rng, x, t, scale)
-            came = command * (0.95 * rng.normal(1, 0.03), scale * rng.normal(1, 0.06))
+            turns = scale * IROBOT_CREATE.gain(*command.tolist())
+            came = command * (0.95 * rng.normal(1, 0.03), turns * rng.normal(1, 0.06))
             waiting.append((t + max(0.2 + 0.08 * rng.standard_normal(), DT), came))
         while waiting and t >= waiting[0][0]:
             wanted = waiting.pop(0)[1]
@@ -162,7 +173,8 @@ def _robot(
             near = 0.3 < math.hypot(dx, dy) < REACH_M and abs(bearing) < HALF_VIEW and subject != n + 1
             if near and rng.random() < 0.6 and not any(_crosses(poses[n, k, :2], point, *wall) for wall in walls):
                 who = subject if rng.random() > MISREAD else int(rng.integers(6, 21))
-                seen.append((k * DT, who, math.hypot(dx, dy), bearing + bias + 0.013 * rng.standard_normal()))
+                depth = recorded_range(math.hypot(dx, dy), bearing)
+                seen.append((k * DT, who, depth, bearing + bias + 0.013 * rng.standard_normal()))
     t = np.asarray(DT * np.arange(poses.shape[1]), dtype=np.float64)
     truth = MotionCapture(t, poses[n, :, :2], np.unwrap(poses[n, :, 2]))
     return Robot(n + 1, odometry, np.array(seen).reshape(-1, 4), truth, 0)

@@ -17,7 +17,6 @@ from coopenv.mrclam.planar_model import (
     COMMANDED,
     DRIFT,
     HEADING,
-    IROBOT_CREATE,
     LEAD,
     PATH,
     SHARE,
@@ -30,13 +29,13 @@ from coopenv.mrclam.planar_model import (
     TURNING,
     CommandHistory,
     PlanarPose,
-    Wheels,
     X,
     Y,
     growth,
     left_out,
     unsure,
 )
+from coopenv.mrclam.wheels import IROBOT_CREATE, Wheels
 from tests.observers.test_filters import derivative
 
 DT = 0.05

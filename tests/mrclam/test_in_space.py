@@ -13,7 +13,7 @@ from coopenv.measurements.kinds import Placed
 from coopenv.mrclam.in_space import FLOOR_PERIOD_TICKS, LEAD_S, spatial_recording_of
 from coopenv.mrclam.recording import TICK_S, load_dataset
 from coopenv.observers.runner import run
-from tests.helpers.mrclam_files import BARCODES, LANDMARKS, ORIGIN, barrier_robots, command, write
+from tests.helpers.mrclam_files import BARCODES, LANDMARKS, ORIGIN, barrier_robots, command, pose, write
 
 ORIGIN_S = 0.1  # of the synthetic files: the first odometry sample
 
@@ -40,7 +40,7 @@ def test_names_and_shapes(recording):
 
 
 def test_increments_lead_from_one_true_pose_to_the_next(recording):
-    first = 6  # the first commands have taken effect
+    first = 16  # the first commands have taken effect
     R, p = recording.truth.rotation[first].copy(), recording.truth.position[first].copy()
     for k in range(first + 1, recording.ticks):
         p = p + (R @ recording.translation[k][..., None])[..., 0]
@@ -59,20 +59,23 @@ def test_the_zoo_runs_and_stays_on_the_plane(dataset, observer):
     assert np.abs(result.rotation[..., 2, :2]).max() < 1e-3
 
 
-def test_ranges_are_those_of_the_files(tmp_path):
-    """Every row of a robot's file is a range at the next tick, towards the target of the barcode."""
+def test_ranges_are_distances_at_the_times_of_the_files(tmp_path):
+    """Every row of a robot's file is a depth towards the target of the barcode, and a range at the next tick."""
     folder = write(tmp_path, seconds=20.0, calibrated=True)
     recording = spatial_recording_of(load_dataset("mrclam_6", tmp_path), "landmarks+robots")
     subjects = {barcode: subject for subject, barcode in BARCODES.items()}
     rows = np.loadtxt(folder / "Robot3_Measurement.dat")
     expected = {}
-    for time, barcode, distance, _ in rows:
+    for time, barcode, _, _ in rows:
+        stamp = np.array([time - ORIGIN])
+        subject = subjects[int(barcode)]
+        there = pose(subject, stamp)[0, :2] if subject <= 5 else LANDMARKS[subject]
         k = math.ceil((time - ORIGIN - ORIGIN_S) / TICK_S - 1e-4)
-        expected[k, recording.setups[2].target_names.index(named(subjects[int(barcode)]))] = distance
+        expected[k, recording.setups[2].target_names.index(named(subject))] = math.dist(there, pose(3, stamp)[0, :2])
     ranges = recording.readings["range"][:, 2, :, 0]
     assert len(expected) > 50 and len(expected) == np.isfinite(ranges).sum()
     for (k, target), distance in expected.items():
-        assert ranges[k, target] == distance
+        assert ranges[k, target] == pytest.approx(distance, abs=1e-6)
     assert np.array_equal(np.isfinite(ranges), recording.visible[:, 2])
 
 
@@ -99,11 +102,11 @@ def test_a_range_is_less_certain_the_farther_the_target():
     sensor = spatial_recording_of(barrier_robots(1, 2.0), "landmarks").setups[0].sensors[0]
     own = Placed.at(np.zeros((2, 3)))
     rows = sensor.linearised(np.eye(3), own, Placed.at(np.array([[1.0, 0, 0], [0, 4.0, 0]])), np.array([[1.1], [3.9]]))
-    np.testing.assert_allclose(rows.noise[:, 0], [0.1**2 + 0.15**2, 0.1**2 + 0.6**2])
+    np.testing.assert_allclose(rows.noise[:, 0], [0.03**2 + 0.03**2, 0.03**2 + 0.12**2])
 
 
 def test_a_command_becomes_motion_later(dataset):
-    """A robot that is sent off at 5 s sets out after the lead of its commands, with the nominal motion."""
+    """A robot that is sent off at 5 s sets out after the lead of its commands; 0.4 s later it has its nominal motion."""
     robots = list(dataset.robots)
     odometry = robots[0].odometry.copy()
     odometry[odometry[:, 0] < 5.0, 1:] = 0.0
@@ -111,8 +114,8 @@ def test_a_command_becomes_motion_later(dataset):
     r = spatial_recording_of(replace(dataset, robots=tuple(robots)), "landmarks")
     v, omega = command(1)
     assert not r.translation[r.t < 4.99 + LEAD_S, 0].any() and not r.angular_velocity[r.t < 4.99 + LEAD_S, 0].any()
-    np.testing.assert_allclose(r.velocity[r.t > 5.11 + LEAD_S, 0, 0], v, rtol=1e-6)
-    np.testing.assert_allclose(r.angular_velocity[r.t > 5.11 + LEAD_S, 0, 2], omega, rtol=1e-6)
+    np.testing.assert_allclose(r.velocity[r.t > 5.51 + LEAD_S, 0, 0], v, rtol=1e-6)
+    np.testing.assert_allclose(r.angular_velocity[r.t > 5.51 + LEAD_S, 0, 2], omega, rtol=1e-6)
     turned = Rotation.from_matrix(r.rotation[200, 0]).as_rotvec()
     np.testing.assert_allclose(turned, [0, 0, omega * TICK_S], atol=1e-9)
 
