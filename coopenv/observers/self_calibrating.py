@@ -58,6 +58,7 @@ class SelfCalibrating(SchmidtKalman):
         self.lasting.reset()
         self.since: dict[int, Array] = {}  # by number of an own message: derivative of the error by the marker's then
         self.corrections: dict[int, tuple[int, Array, Array]] = {}  # by target: number of its message, shift, reduction
+        self.last: dict[int, Message] = {}  # by sender
         self.measured_at: dict[int, int] = {}  # by target: number of the first own message after its measurement
         super().reset(initial_pose, initial_covariance)
 
@@ -77,7 +78,9 @@ class SelfCalibrating(SchmidtKalman):
         R, p, _ = predicted(LEFT, self.state.R, self.state.p, self.state.P, step.rotation, step.translation, noise)
         self.state = UncertainPose(LEFT, R, p, self.P[:6, :6])
         for target, received in tick.messages.items():
-            self.receive(target, received.message)
+            if self.last.get(target) is not received.message:
+                self.last[target] = received.message
+                self.receive(target, received.message)
 
     def propagate_cross_covariances(self, A: Array, others: Sequence[int] | None = None) -> None:
         """Multiply the own error by A also since the last own messages."""
@@ -111,7 +114,7 @@ class SelfCalibrating(SchmidtKalman):
         cross = self.taken_over(target, message)
         made = np.asarray(message.extra.get("corrections", ()))
         if made.ndim == 2 and made.shape[1:] == (44,) and made.dtype.kind == "f":
-            for one in made[made[:, 0] == self.me]:
+            for one in made[(made[:, 0] == self.me) & np.isfinite(made).all(axis=1)]:
                 self.take_correction(int(one[1]), one[2:8], one[8:].reshape(6, 6))
         if cross is not None:
             now = self.neighbours[target]
@@ -123,10 +126,10 @@ class SelfCalibrating(SchmidtKalman):
         targets, numbers = (np.asarray(message.extra.get(name, ())) for name in ("targets", "numbers"))
         if targets.ndim != 1 or targets.shape != numbers.shape or self.me not in targets:
             return None
-        number = int(numbers[targets == self.me][0])
+        number = float(numbers[targets == self.me][0])
         if number not in self.since or number < self.measured_at.get(target, 0):
             return None
-        return self.since[number].dot(sent_cross_covariance(message, self.me).T)
+        return self.since[int(number)].dot(sent_cross_covariance(message, self.me).T)
 
     def take_correction(self, number: int, shift: Array, reduced: Array) -> None:
         """Correct the own estimate by a neighbour's measurement of this vehicle.
@@ -139,7 +142,7 @@ class SelfCalibrating(SchmidtKalman):
         if number not in self.since:
             return
         by_then, size = self.since[number], len(self.P)
-        after = self.P - by_then.dot(reduced).dot(by_then.T)
+        after = self.P - by_then.dot(reduced + reduced.T).dot(by_then.T) / 2
         if np.linalg.eigvalsh(after)[0] <= 0.0:
             return
         dx = by_then.dot(shift)

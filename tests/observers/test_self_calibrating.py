@@ -166,7 +166,12 @@ def test_a_measured_vehicle_is_corrected_as_by_one_filter_of_all() -> None:
 
 def test_corrections_that_are_lost_or_damaged_change_no_other_estimate() -> None:
     recording = line_of_two()
-    damaged = (np.zeros(44), np.full((1, 44), np.nan), np.array([["a"] * 44]), np.array([[6.0, -1.0, *[1e9] * 42]]))
+    damaged = (
+        np.zeros(44),
+        np.array([[5.0, *[np.nan] * 43]]),
+        np.array([["a"] * 44]),
+        np.array([[5.0, -1.0, *[1e9] * 42]]),
+    )
     for wrong in damaged:
 
         def spoilt(message: Message, wrong: np.ndarray = wrong) -> Message:
