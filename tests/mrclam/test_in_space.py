@@ -106,7 +106,7 @@ def test_a_range_is_less_certain_the_farther_the_target():
 
 
 def test_a_command_becomes_motion_later(dataset):
-    """A robot that is sent off at 5 s sets out after the lead of its commands; 0.4 s later it has its nominal motion."""
+    """A robot that is sent off at 5 s sets out after the lead of its commands; 0.4 s later it moves as nominal."""
     robots = list(dataset.robots)
     odometry = robots[0].odometry.copy()
     odometry[odometry[:, 0] < 5.0, 1:] = 0.0
