@@ -129,7 +129,7 @@ class SelfCalibrating(SchmidtKalman):
         number = float(numbers[targets == self.me][0])
         if number not in self.since or number < self.measured_at.get(target, 0):
             return None
-        return self.since[int(number)].dot(sent_cross_covariance(message, self.me).T)
+        return np.asarray(self.since[int(number)].dot(sent_cross_covariance(message, self.me).T))
 
     def take_correction(self, number: int, shift: Array, reduced: Array) -> None:
         """Correct the own estimate by a neighbour's measurement of this vehicle.
