@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from coopenv.base.errors import check_one_of
 from coopenv.base.installation import is_reference
 from coopenv.estimation.poses import Array, skew
-from coopenv.measurements.kinds import Kind, Landmarks, Placed
+from coopenv.measurements.kinds import Kind, Landmarks, Placed, WarpFunctions
 from coopenv.measurements.named import allow
 from coopenv.measurements.table import KINDS
 
@@ -45,6 +45,27 @@ def _shipped(name: str) -> Kind:
     module, _, kind = KINDS[name].partition(":")
     made: Kind = getattr(import_module(f"{__package__}.{module}"), kind)()
     return made
+
+
+_of_users: list[WarpFunctions] = []
+
+
+def number_of(reference: str, kind: Kind) -> int:
+    """Return the number of a kind in kernels: users' kinds follow on the table; -1: without Warp functions."""
+    if reference in KINDS:
+        return [*KINDS].index(reference)
+    if kind.in_warp is None:
+        return -1
+    if kind.in_warp not in _of_users:
+        _of_users.append(kind.in_warp)
+    return len(KINDS) + _of_users.index(kind.in_warp)
+
+
+def functions_of(number: int) -> WarpFunctions:
+    """Return the Warp functions of the kind of a number."""
+    functions = _shipped([*KINDS][number]).in_warp if number < len(KINDS) else _of_users[number - len(KINDS)]
+    assert functions is not None
+    return functions
 
 
 def averaged_std(white: Array, correlated: float, time: float, period: float) -> Array:

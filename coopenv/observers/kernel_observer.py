@@ -17,8 +17,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array, Coordinates, left_covariance
 from coopenv.measurements.kinds import MOST_ROWS
-from coopenv.measurements.sensor import MAP
-from coopenv.measurements.table import KINDS
+from coopenv.measurements.sensor import MAP, number_of
 from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick, check_message
 from coopenv.world.embedded import Embedded, Messages
 from coopenv.world.launch import Launcher, start_warp
@@ -90,7 +89,7 @@ def _add_sensors(model: Any, setup: Setup, p: Precision) -> None:
     entries, measures = [], np.zeros((len(sensors), T), np.int32)
     for number, sensor in enumerate(sensors):
         kind, entry = sensor.kind, entry_struct(p, "sensor")()
-        entry.kind = [*KINDS].index(sensor.reference) if sensor.reference in KINDS else -1
+        entry.kind = number_of(sensor.reference, kind)
         entry.rows, entry.has_target, entry.ratio = kind.rows, int(kind.has_target), 1.0
         entry.rotation, entry.position = p.mat33(*sensor.rotation.ravel()), p.vec3(*sensor.position)
         std = np.hypot(sensor.std, sensor.std_by_distance * USUAL_DISTANCE)

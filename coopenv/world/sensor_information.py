@@ -83,13 +83,15 @@ def inform_of(functions: WarpFunctions) -> Any:
         p = R_hat * ahead + body * own.position
         z = p - p
         o = p - p
+        turning = wp.cross(state.odometry_angular_velocity[world, vehicle], own.position)
+        v = body * (state.odometry_velocity[world, vehicle] + turning)
         target_R = R
         square = p.dtype(COMPARED_AT_SQUARE)
         if own.has_target == 1:
             z = known_position(model, state, world, vehicle, target, target)
             target_R = known_rotation(model, state, world, vehicle, target)
             square = wp.length_sq(z - p)
-        by_own, _ = jacobian(R, p, o, target_R, z, o)
+        by_own, _ = jacobian(R, p, v, target_R, z, o)
         for row in range(MOST_ROWS):
             if own.weight[row] > p.dtype(0.0):
                 add_information(state, world, vehicle, sensor, by_own[row], square * own.weight[row], R, p)

@@ -16,7 +16,7 @@ from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array
 from coopenv.measurements.bearing import Bearing
 from coopenv.measurements.kinds import MOST_ROWS, WarpFunctions
-from coopenv.measurements.table import KINDS
+from coopenv.measurements.sensor import number_of
 from coopenv.scenario import Scenario
 from coopenv.scenario.sensors import SensorSection
 from coopenv.world.camera import behind_building, inverse_square_of, marker_position, occlusion
@@ -52,7 +52,7 @@ def sensor_entries(section: SensorSection, scenario: Scenario) -> dict[str, Any]
     return {
         "rotation": section.mounting,
         "position": section.position,
-        "kind": [*KINDS].index(section.kind) if section.kind in KINDS else -1,
+        "kind": number_of(section.kind, kind),
         "rows": kind.rows,
         "has_target": kind.has_target,
         "ratio": min(1.0, (section.rate or camera) / camera),

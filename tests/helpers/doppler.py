@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.measurements.in_warp import plus_noise
+from coopenv.measurements.in_warp import excess, first_row, plus_noise, rows_of
 from coopenv.measurements.kinds import Placed, WarpFunctions
 
 
@@ -29,8 +29,26 @@ def predict_doppler(R: Any, p: Any, v: Any, target_R: Any, target_p: Any, target
     return type(empty)(wp.dot(wp.normalize(target_p - p), target_v - v), o, o, o, o, o)
 
 
+@wp.func
+def derive_doppler(R: Any, p: Any, v: Any, target_R: Any, target_p: Any, target_v: Any):
+    """Return the derivatives by the sensor and by the target; a turn turns the velocity with it."""
+    line = target_p - p
+    u = wp.normalize(line)
+    moving = target_v - v
+    across = (moving - wp.dot(u, moving) * u) / wp.length(line)
+    turn = wp.transpose(R) * wp.cross(u, v)
+    target_turn = wp.transpose(target_R) * wp.cross(target_v, u)
+    return rows_of(first_row(turn), first_row(-across)), rows_of(first_row(target_turn), first_row(across))
+
+
 class DopplerInWarp(Doppler):
     """The same sensor with functions for kernels."""
+
+    in_warp = WarpFunctions(predict_doppler, plus_noise, excess, derive_doppler)
+
+
+class DopplerOfWorlds(Doppler):
+    """The same sensor without what an observer in kernels needs."""
 
     in_warp = WarpFunctions(predict_doppler, plus_noise)
 

@@ -244,7 +244,7 @@ class Regressor:
     coefficient: mat66d
 
 
-def memory_struct(entries: str, of_reading: Any) -> Any:
+def memory_struct(entries: str, of_reading: Any, name: str = "RobustMemory") -> Any:
     """Return the Warp struct of the memory.
 
     Functions that differ for worlds with sensors beside the camera are overloads for both structs (readings.py).
@@ -252,9 +252,9 @@ def memory_struct(entries: str, of_reading: Any) -> Any:
     Args:
         entries: the axis of a frame's measurements, F; or X where all of them are bearings of the camera.
         of_reading: the struct of what a measurement of another sensor has beside; `Nothing` without any.
+        name: of the struct; functions tell structs with the same fields apart by it.
     """
 
-    @wp.struct
     class RobustMemory:
         """The memory of a world's observers.
 
@@ -293,7 +293,8 @@ def memory_struct(entries: str, of_reading: Any) -> Any:
         reading_tick: array("WNR", wp.int32)  # of the last frame with measurements of a sensor; -1: none
         factor: array("WLKK", mat66d)  # blocks of a Cholesky factor, on its diagonal their inverses
 
-    return RobustMemory
+    RobustMemory.__qualname__ = name
+    return wp.struct(RobustMemory)
 
 
 RobustMemory, RobustMemoryWithReadings = memory_struct("X", Nothing), memory_struct("F", FusedReading)

@@ -12,14 +12,16 @@ cross-covariances become -G H_o P_o.
 """
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.linalg import orthonormalise, sheared, skew, symmetric_part
 from coopenv.estimation.poses import Coordinates
+from coopenv.measurements.sensor import functions_of
+from coopenv.measurements.table import KINDS
 from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.registry import observer_of_robots
@@ -59,6 +61,7 @@ from coopenv.observers.robust.measurements import RESECTION, TRACKING, set_beari
 from coopenv.observers.robust.memory import (
     ROBUST_SIZES,
     BearingFrame,
+    FusedReading,
     Pose,
     PoseEstimate,
     RobustMemory,
@@ -66,13 +69,14 @@ from coopenv.observers.robust.memory import (
     clear,
     mat33d,
     mat66d,
+    memory_struct,
     robust_rules,
     vec2d,
     vec3d,
     vec6d,
 )
 from coopenv.observers.robust.messages import ROBUST_MESSAGES, bit_of
-from coopenv.observers.robust.readings import NAMES, add_readings, unused_rows
+from coopenv.observers.robust.readings import add_readings, rows_in, rows_of_kind, unused_rows
 from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
 from coopenv.observers.robust.sources import begin_sources, is_excluded
 from coopenv.world.embedded import Embedded
@@ -402,10 +406,29 @@ OPTIONS = {"max_unroll": 1}
 
 def fitted(model: Any) -> Embedded:
     """Return the variant for the sensors of a model. Raises CoopenvError: it cannot take one of them."""
-    kinds = model.sensor.numpy()["kind"] if model.sensor.shape[0] else np.zeros(0)
-    if (kinds < 0).any():
-        raise CoopenvError(f"observer 'robust' takes the kinds {', '.join(NAMES)}, and no class of one's own")
-    return WITH_READINGS if len(kinds) else ROBUST
+    kinds = {*model.sensor.numpy()["kind"].tolist()} if model.sensor.shape[0] else set()
+    if -1 in kinds:
+        raise CoopenvError("observer 'robust' takes a class of one's own only with functions in Warp (`in_warp`)")
+    if any(number >= len(KINDS) for number in kinds):
+        return with_own(tuple(sorted(kinds)))
+    return WITH_READINGS if kinds else ROBUST
+
+
+@cache
+def with_own(numbers: tuple[int, ...]) -> Embedded:
+    """Return the variant for kinds of measurements, some of them users', by their numbers.
+
+    Raises:
+        CoopenvError: a function is missing.
+    """
+    kinds = {number: functions_of(number) for number in numbers}
+    for functions in kinds.values():
+        if functions.jacobian is None:
+            raise CoopenvError(f"observer 'robust': {functions.predict.key}: its class has no `jacobian` in Warp")
+    name = "_".join(["robust_with_readings", *map(str, numbers)])
+    Memory = memory_struct("F", FusedReading, name)
+    rows_of_kind.add_overload(rows_in(Memory, kinds))
+    return replace(ROBUST, name=name, memory=Memory)
 
 
 ROBUST = Embedded(

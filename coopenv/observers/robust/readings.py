@@ -8,12 +8,15 @@ since its report, and the variance of the linearisation error.
 Functions with two overloads do nothing in worlds without such sensors.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import warp as wp
 
 from coopenv.estimation.linalg import exp_so3, skew
-from coopenv.measurements.sensor import kind_of
+from coopenv.measurements.in_warp import excess
+from coopenv.measurements.kinds import WarpFunctions
+from coopenv.measurements.sensor import functions_of
 from coopenv.measurements.table import KINDS
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust import constants
@@ -47,36 +50,38 @@ from coopenv.world.model import STATIC
 from coopenv.world.nearby import box_of_entry
 from coopenv.world.warp_internals import device_function, overload_of
 
-NAMES = list(KINDS)
-BEARING, RANGE_BEARING, RELATIVE_POSE = (NAMES.index(name) for name in ("bearing", "range_bearing", "relative_pose"))
+BEARING, RANGE_BEARING, RELATIVE_POSE = ([*KINDS].index(name) for name in ("bearing", "range_bearing", "relative_pose"))
 
 
-def _rows_from(number: int) -> Any:
-    """Return the Warp function of the rows of all shipped kinds from a number on."""
-    kind_in_warp = kind_of(NAMES[number]).in_warp
-    assert kind_in_warp is not None
-    predict, residual, jacobian = kind_in_warp.predict, kind_in_warp.residual, kind_in_warp.jacobian
-    further = _rows_from(number + 1) if number + 1 < len(NAMES) else None
+def rows_in(Memory: Any, kinds: Mapping[int, WarpFunctions]) -> Any:
+    """Return the Warp function of the rows of kinds by their numbers, for one struct of the memory."""
+    (number, functions), *others = kinds.items()
+    predict, jacobian = functions.predict, functions.jacobian
+    residual = functions.residual or excess
+    further = rows_in(Memory, dict(others)) if others else None
 
     @device_function
-    def last(kind: int, value: Any, R: Any, p: Any, target_R: Any, target_p: Any):
+    def last(
+        memory: Memory, kind: int, value: Any, R: Any, p: Any, v: Any, target_R: Any, target_p: Any, target_v: Any
+    ):
         """Return the rows of the last kind."""
-        still = p - p
-        predicted = predict(R, p, still, target_R, target_p, still, vec6d())
-        by_own, by_target = jacobian(R, p, still, target_R, target_p, still)
+        predicted = predict(R, p, v, target_R, target_p, target_v, vec6d())
+        by_own, by_target = jacobian(R, p, v, target_R, target_p, target_v)
         return residual(value, predicted, p), predicted, by_own, by_target
 
     @device_function
-    def rows(kind: int, value: Any, R: Any, p: Any, target_R: Any, target_p: Any):
+    def rows(
+        memory: Memory, kind: int, value: Any, R: Any, p: Any, v: Any, target_R: Any, target_p: Any, target_v: Any
+    ):
         """Return residual, prediction, and derivatives by errors of the sensor and of the target."""
         if kind == number:
-            return last(kind, value, R, p, target_R, target_p)
-        return further(kind, value, R, p, target_R, target_p)
+            return last(memory, kind, value, R, p, v, target_R, target_p, target_v)
+        return further(memory, kind, value, R, p, v, target_R, target_p, target_v)
 
     return last if further is None else rows
 
 
-rows_of_kind = _rows_from(0)
+rows_of_kind = rows_in(RobustMemoryWithReadings, {number: functions_of(number) for number in range(len(KINDS))})
 
 
 @device_function
@@ -152,9 +157,7 @@ def add_readings(memory: RobustMemory, model: Any, state: Any, world: int, i: in
 
 
 @overload_of(add_readings, subroutine=True)
-def add_readings_with_sensors(
-    memory: RobustMemoryWithReadings, model: Any, state: Any, world: int, i: int, frame: BearingFrame
-) -> int:
+def add_readings_with_sensors(memory: Any, model: Any, state: Any, world: int, i: int, frame: BearingFrame) -> int:
     """Add the measurements of other sensors to the frame's bearings; return the number of all."""
     for n in range(frame.bearings):
         memory.reading[world, i, n].part = -1
@@ -194,7 +197,7 @@ def is_reading(memory: RobustMemory, world: int, i: int, n: Any) -> bool:
 
 
 @overload_of(is_reading)
-def is_reading_with_sensors(memory: RobustMemoryWithReadings, world: int, i: int, n: Any) -> bool:
+def is_reading_with_sensors(memory: Any, world: int, i: int, n: Any) -> bool:
     """Return whether a measurement is one of a sensor beside the camera."""
     return memory.reading[world, i, n].part >= 0
 
@@ -206,7 +209,7 @@ def unused_rows(memory: RobustMemory, world: int, i: int, count: Any) -> int:
 
 
 @overload_of(unused_rows)
-def unused_rows_with_sensors(memory: RobustMemoryWithReadings, world: int, i: int, count: Any) -> int:
+def unused_rows_with_sensors(memory: Any, world: int, i: int, count: Any) -> int:
     """Return how many rows of the measurements that fit were not measured."""
     unused = int(0)
     for n in range(count):
@@ -245,7 +248,7 @@ def linearise_reading(memory: RobustMemory, world: int, i: int, n: Any) -> bool:
 
 
 @overload_of(linearise_reading, subroutine=True)
-def linearise_reading_with_sensors(memory: RobustMemoryWithReadings, world: int, i: int, n: Any) -> bool:
+def linearise_reading_with_sensors(memory: Any, world: int, i: int, n: Any) -> bool:
     """Linearise the n-th measurement, one of another sensor; return whether its target is ahead of the sensor."""
     member = memory.measurement[world, i, n].member
     point = memory.measurement[world, i, n].point
@@ -259,10 +262,15 @@ def linearise_reading_with_sensors(memory: RobustMemoryWithReadings, world: int,
         z = memory.member[world, i, member].pose.p + theirs_R * point
         target_R = theirs_R * target_R
     R = own.R * mounted
-    p = own.p + own.R * memory.reading[world, i, n].place
+    place = memory.reading[world, i, n].place
+    p = own.p + own.R * place
+    v = own.R * (memory.belief[world, i].sample_v + wp.cross(memory.belief[world, i].sample_w, place))
+    target_v = p - p
+    if member > 0:
+        target_v = theirs_R * (memory.member[world, i, member].v + wp.cross(memory.member[world, i, member].w, point))
     kind = memory.reading[world, i, n].kind
     value = memory.reading[world, i, n].value
-    residual, predicted, by_own, by_target = rows_of_kind(kind, value, R, p, target_R, z)
+    residual, predicted, by_own, by_target = rows_of_kind(memory, kind, value, R, p, v, target_R, z, target_v)
     line = z - p
     distance = wp.max(wp.length(line), wp.float64(1.0e-9))
     u = line / distance
@@ -271,7 +279,7 @@ def linearise_reading_with_sensors(memory: RobustMemoryWithReadings, world: int,
         to_own = wp.transpose(own.R)
         along, across = relative_spread(memory, world, i, member, to_own * theirs_R, to_own * u)
         bend = bend_variances(member, memory.reading[world, i, n].period, along, across) / (distance * distance)
-    arm = own.R * skew(memory.reading[world, i, n].place)
+    arm = own.R * skew(place)
     reach = theirs_R * skew(point)
     H = mat26d()
     G = mat26d()

@@ -12,7 +12,6 @@ from coopenv.observers.robust.memory import (
     SOURCES,
     Pose,
     RobustMemory,
-    RobustMemoryWithReadings,
     SourceMonitor,
     fill,
     mat33d,
@@ -37,9 +36,7 @@ def is_seen(memory: RobustMemory, state: Any, world: int, i: int, entry: int, ti
 
 
 @overload_of(is_seen)
-def is_seen_with_sensors(
-    memory: RobustMemoryWithReadings, state: Any, world: int, i: int, entry: int, tick: int
-) -> bool:
+def is_seen_with_sensors(memory: Any, state: Any, world: int, i: int, entry: int, tick: int) -> bool:
     """Return whether the target of an entry is measured at a tick, by the camera or by another sensor."""
     for sensor in range(state.reading_tick.shape[2]):
         if state.reading_tick[world, i, sensor, entry] == tick:

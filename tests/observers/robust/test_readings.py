@@ -17,6 +17,7 @@ from coopenv.estimation.poses import about_z
 from coopenv.measurements.kinds import Placed
 from coopenv.measurements.sensor import MAP, Reading, Sensor, kind_of
 from coopenv.measurements.table import KINDS
+from coopenv.observers import Tick
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.robust.observer import ROBUST, WITH_READINGS
 from coopenv.runs.recorder import record
@@ -46,6 +47,8 @@ LANDMARK_ROTATION = about_z(np.array([0.3, -1.0, 2.0, 0.0, 3.0]))
 MOUNTED = displaced((np.eye(3), np.zeros(3)), np.array([0.2, -0.5, 0.4, 0.4, -0.2, 0.3]))
 STD = {"bearing": 0.003, "range": 0.02, "position": 0.03, "attitude": 0.005, "relative_pose": 0.03}
 SENDER = len(LANDMARKS) + 1
+TWIST = np.array([[3.0, 0.4, -0.2], [0.05, -0.1, 0.3]])
+DOPPLER = "tests.helpers.doppler:DopplerInWarp"
 
 
 def sensor_of(kind: str, targets: Sequence[int]) -> Sensor:
@@ -74,15 +77,20 @@ def target_of(target: int, sender: Pose | None = None) -> Placed:
 
 
 def prediction(sensor: Sensor, pose: Pose, target: Placed) -> np.ndarray:
-    own = Placed.at(pose[1] + pose[0] @ sensor.position, pose[0] @ sensor.rotation)
-    return sensor.kind.predict(own, target)
+    return sensor.kind.predict(sensor.placed(*pose, *TWIST), target)
+
+
+def measured(observer: OpenRobust, sensor: Sensor, values: np.ndarray, **given: Any) -> Tick:
+    """Return the first tick of an observer, with measurements of a sensor."""
+    readings = (Reading(sensor, values),)
+    return replace(tick(observer, 1, **given), velocity=TWIST[0], angular_velocity=TWIST[1], readings=readings)
 
 
 def drawn_value(rng: np.random.Generator, sensor: Sensor, pose: Pose, target: Placed) -> np.ndarray:
     return sensor.kind.sample(prediction(sensor, pose, target), rng.normal(size=sensor.kind.rows) * sensor.std)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*KINDS, pytest.param(DOPPLER, marks=pytest.mark.slow)])
 def test_a_frame_of_one_sensor_is_a_least_squares(kind: str) -> None:
     """The pose and the covariance are those of the most probable pose, by the kinds in NumPy."""
     rng = np.random.default_rng(1)
@@ -91,7 +99,7 @@ def test_a_frame_of_one_sensor_is_a_least_squares(kind: str) -> None:
     targets = [target_of(target) for target in sensor.targets]
     values = np.array([drawn_value(rng, sensor, truth, target) for target in targets])
     observer = sensing(sensor, P=P)
-    observer.update(replace(tick(observer, 1), readings=(Reading(sensor, values),)))
+    observer.update(measured(observer, sensor, values))
     whiten = np.linalg.inv(np.linalg.cholesky(predicted(P)))
 
     def residuals(e: np.ndarray) -> np.ndarray:
@@ -123,8 +131,7 @@ def test_a_sender_s_error_is_considered(kind: str) -> None:
     reported = message.rotation, message.position - message.rotation @ MARKER
     true_sender = drawn(rng, there, Q)
     value = drawn_value(rng, sensor, drawn(rng, AT, P), target_of(SENDER, true_sender))
-    given = tick(observer, 1, messages={1: (message, 0.0)})
-    observer.update(replace(given, readings=(Reading(sensor, value[None]),)))
+    observer.update(measured(observer, sensor, value[None], messages={1: (message, 0.0)}))
 
     def expected_value(e: np.ndarray) -> np.ndarray:
         value = prediction(sensor, displaced(AT, e[:6]), target_of(SENDER, displaced(reported, e[6:])))
@@ -154,9 +161,9 @@ def test_an_outlier_is_rejected_and_counts_in_no_degree_of_freedom() -> None:
     values = np.array([prediction(sensor, AT, target_of(target)) for target in (0, 1)])
     observer, other = sensing(sensor, P=P), sensing(sensor, P=P)
     values[1] += 5.0
-    estimate = observer.update(replace(tick(observer, 1), readings=(Reading(sensor, values),)))
+    estimate = observer.update(measured(observer, sensor, values))
     values[1] = np.nan
-    alone = other.update(replace(tick(other, 1), readings=(Reading(sensor, values),)))
+    alone = other.update(measured(other, sensor, values))
     assert estimate.nis_dof == alone.nis_dof == 1
     assert_allclose(observer.P[:6, :6], other.P[:6, :6], atol=1e-12)
 
@@ -167,7 +174,7 @@ def test_a_landmark_without_a_known_orientation_gives_its_place_alone() -> None:
     rotation[0] = np.nan
     observer = sensing(sensor, P=P, rotation=rotation)
     values = prediction(sensor, AT, target_of(0))[None]
-    assert observer.update(replace(tick(observer, 1), readings=(Reading(sensor, values),))).nis_dof == 3
+    assert observer.update(measured(observer, sensor, values)).nis_dof == 3
 
 
 RANGES = [{"kind": "range", "towards": ["vehicles"]}]
@@ -200,11 +207,10 @@ def test_worlds_get_the_kernels_that_they_need(sensors: Any, variant: Any) -> No
     assert ROBUST.fit(build_model(scenario, precision("float32"), "cpu")) is variant
 
 
-def test_a_class_of_one_s_own_is_refused_in_one_line() -> None:
-    own = Sensor("own", "tests.helpers.doppler:Doppler", np.ones(1), np.array([0]), np.zeros(3), np.eye(3))
-    with pytest.raises(
-        CoopenvError, match=r"observer 'robust' takes the kinds bearing, range,.* no class of one's own"
-    ):
+@pytest.mark.parametrize(("name", "missing"), [("Doppler", "in_warp"), ("DopplerOfWorlds", "jacobian")])
+def test_a_class_without_functions_in_warp_is_refused_in_one_line(name: str, missing: str) -> None:
+    own = Sensor("own", f"tests.helpers.doppler:{name}", np.ones(1), np.array([0]), np.zeros(3), np.eye(3))
+    with pytest.raises(CoopenvError, match=f"observer 'robust'.*{missing}"):
         OpenRobust(replace(known(), sensors=(own,)))
 
 
