@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coopenv.measurements.sensor import Reading, Sensor
-from coopenv.mrclam.in_space import FLOOR_PERIOD_TICKS, RANGE_STD, RANGE_STD_BY_DISTANCE, spatial_recording_of
+from coopenv.mrclam.recording import FLOOR_PERIOD_TICKS, RANGE_STD, RANGE_STD_BY_DISTANCE, recording_of
 from coopenv.observers import Message, Recording, Tick, run
 from coopenv.observers.contract import SensorNoise
 from coopenv.observers.frame import linearised, usable_measurements
@@ -274,7 +274,7 @@ class PlanarOracle:
 
 def test_on_a_plane_it_is_the_filter_of_x_y_and_heading() -> None:
     """A level floor and a known height leave the filter of the plane, with every lasting error that it estimates."""
-    recording = spatial_recording_of(barrier_robots(2, 16.0, 0.8), "landmarks")
+    recording = recording_of(barrier_robots(2, 16.0, 0.8), "landmarks")
     oracle, observer = PlanarOracle(recording, 0), Ungated(recording.setups[0])
     observer.reset((recording.start_rotation[0], recording.start_position[0]), recording.start_covariance[0])
     assert recording.visible[:, 0].any(axis=1).sum() > 10 and recording.ticks > 2 * FLOOR_PERIOD_TICKS
@@ -293,7 +293,7 @@ def test_on_a_plane_it_is_the_filter_of_x_y_and_heading() -> None:
 
 @pytest.mark.parametrize("turn_scale", [0.6, pytest.param(1.4, marks=pytest.mark.slow)])
 def test_robots_that_turn_less_than_commanded_are_estimated_consistently(turn_scale: float) -> None:
-    recording = spatial_recording_of(barrier_robots(1, 40.0, turn_scale), "landmarks+robots")
+    recording = recording_of(barrier_robots(1, 40.0, turn_scale), "landmarks+robots")
     result = completed("self_calibrating", recording)
     without = completed("schmidt_kalman", recording)
     assert result.position_rmse().mean() < min(0.15, without.position_rmse().mean())
@@ -302,7 +302,7 @@ def test_robots_that_turn_less_than_commanded_are_estimated_consistently(turn_sc
 
 def test_a_floor_does_not_open_the_gate() -> None:
     """The heading of a level floor is unknown; the innovation of a row that is not measured is no doubt."""
-    recording = spatial_recording_of(barrier_robots(1, 8.0), "landmarks")
+    recording = recording_of(barrier_robots(1, 8.0), "landmarks")
     observer = SelfCalibrating(recording.setups[0])
     observer.reset((recording.start_rotation[0], recording.start_position[0]), recording.start_covariance[0])
     for k in range(1, recording.ticks):
