@@ -109,7 +109,7 @@ def test_truth_has_gaps(dataset):
     expected[[240, 300]] = True  # rows that stand alone, at the tick next to them
     assert known.tolist() == expected.tolist()
     x, y, _ = pose(2, np.array([ORIGIN_S + r.t[240]]))[0]
-    np.testing.assert_allclose(r.truth.position[240, 1, :2], [x, y], atol=1e-4)  # 2 mm from the row
+    np.testing.assert_allclose(r.truth.position[240, 1, :2], [x, y], atol=5e-4)  # 2 mm from the row
     heading_known = np.isfinite(r.truth.rotation[:, 1, 0, 0])
     assert not heading_known[(r.t > 8.0) & (r.t < 8.5)].any()
     assert heading_known[known & ((r.t < 7.9) | (r.t > 8.55))].all()
