@@ -50,6 +50,10 @@ class DataError(CoopenvError):
     """A recorded file is damaged or of another kind."""
 
 
+class UserCodeError(CoopenvError):
+    """A user's sensor or drive cannot be used, or has raised something; the message names file, class and function."""
+
+
 class ScenarioWarning(UserWarning):
     """The scenario is possible but the theory's conditions may not hold."""
 

@@ -130,7 +130,7 @@ def record(given: RecordOptions) -> None:
         write_page,
     )
     from coopenv.sources.registry import kind_of
-    from coopenv.sources.sources import open_backend, open_recording
+    from coopenv.sources.sources import allow_kinds, open_backend, open_recording
 
     out, page, observer, environment = given.out, given.out.with_suffix(".html"), given.observer, given.environment
     check_log(out, observer, given.scene)
@@ -142,7 +142,7 @@ def record(given: RecordOptions) -> None:
     refuse_for_recordings(environment, given.seed, given.policy)
     log, played = options.console(stderr=True), None
     if kind.reader:
-        if given.changes:
+        if allow_kinds(given.changes):
             raise CoopenvError(f"--override: is for a simulation, {environment} is recorded")
         recording = open_recording(environment, given.data, given.variant, given.selection)
     else:

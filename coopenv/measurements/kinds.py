@@ -142,8 +142,10 @@ class Kind(ABC):
 
     @property
     def parts(self) -> tuple[tuple[str, int, str], ...]:
-        """Name, size and unit of the parts of a value; one without a name is the whole value."""
-        return (("", self.size, self.units[0]),)
+        """Name, size and unit of the parts of a value: the whole, without a name, or each number by its own unit."""
+        if self.size != self.rows or len({*self.units}) == 1:
+            return (("", self.size, self.units[0]),)
+        return tuple((str(number), 1, unit) for number, unit in enumerate(self.units, 1))
 
     def residual(self, value: Array, predicted: Array) -> Array:
         """Return (..., rows) by how much values exceed predicted ones, to first order linear in errors."""

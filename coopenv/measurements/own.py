@@ -8,17 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.base.errors import CoopenvError, error_text, shown
+from coopenv.base.errors import UserCodeError, error_text, shown
 from coopenv.base.installation import load_reference
 from coopenv.estimation.poses import Array
 from coopenv.measurements.kinds import MOST_ROWS, Kind, Landmarks, Placed, exponential
 
 AGREEMENT = 1e-4  # of a derivative with differences, relative to its largest entry
-TRIALS = 3  # places at which a kind is tried before it is used
-
-
-class SensorError(CoopenvError):
-    """A user's sensor cannot be used, or has raised something; the message names file, class and function."""
+PLACES, TRIALS = 30, 3  # drawn before a class is used, and those at which it is tried
 
 
 class OwnKind(Kind):
@@ -37,7 +33,7 @@ class OwnKind(Kind):
         self.reference = reference
         made = load_reference(reference)
         if not (inspect.isclass(made) and callable(getattr(made, "predict", None))):
-            raise SensorError(f"sensor '{reference}': expected a class with predict(own, target), got {shown(made)}")
+            raise UserCodeError(f"sensor '{reference}': expected a class with predict(own, target), got {shown(made)}")
         self.own = self._call("its start", made, **options)
         self.has_target = bool(getattr(self.own, "has_target", True))
         self.towards = self._names("towards", Kind.towards if self.has_target else ("map",))
@@ -83,8 +79,7 @@ class OwnKind(Kind):
         """Return (...) whether a target can be measured."""
         if not hasattr(self.own, "sensed"):
             return super().sensed(own, target)
-        found = [bool(self._call("sensed", self.own.sensed, *pair)) for pair in self._pairs(own, target)]
-        return np.array(found, bool).reshape(own.position.shape[:-1])
+        return np.not_equal(self._each("sensed", 1, own, target)[..., 0], 0.0)
 
     def _pairs(self, own: Placed, target: Placed) -> list[tuple[Placed, Placed]]:
         return [(own, target)] if own.position.ndim == 1 else [*zip(own.each(), target.each(), strict=True)]
@@ -95,29 +90,24 @@ class OwnKind(Kind):
         return np.array(values).reshape(*own.position.shape[:-1], size)
 
     def _call(self, name: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-        """Return the result of a user's function. Raises SensorError: it raises something."""
+        """Return the result of a user's function. Raises UserCodeError: it raises something."""
         try:
             return function(*arguments, **options)
-        except Exception as error:  # of any user's code
-            raise SensorError(f"sensor '{self.reference}': {name}: {error_text(error)}") from error
+        except (Exception, SystemExit) as error:  # of any user's code
+            raise UserCodeError(f"sensor '{self.reference}': {name}: {error_text(error)}") from error
 
     def _checked(self, name: str, value: Any, *shape: int) -> Array:
-        """Return an array of a shape. Raises SensorError: it has another one, or is no array of numbers."""
-        try:
-            array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            array = np.empty(0)
+        """Return an array of a shape. Raises UserCodeError: it has another one, or is no array of numbers."""
+        array = as_numbers(value)
         if shape[0] == 1 and array.shape == shape[1:]:  # one row may come without its axis
             array = array.reshape(shape)
         if array.shape != shape:
-            raise SensorError(f"sensor '{self.reference}': {name}: expected shape {shape}, got {shown(value)}")
+            raise UserCodeError(f"sensor '{self.reference}': {name}: expected shape {shape}, got {shown(value)}")
         return array
 
     def _try(self) -> None:
         """Find the shapes at a few random places, and compare a given Jacobian with differences."""
-        rng = np.random.default_rng(0)
-        places = [placed_at_random(rng) for _ in range(2 * TRIALS)]
-        for own, target in zip(places[::2], places[1::2], strict=True):
+        for own, target in self._trials():
             value = self._numbers("predict", self._call("predict", self.own.predict, own, target))
             self.size = len(value)
             change: Any = value
@@ -128,14 +118,19 @@ class OwnKind(Kind):
             self.needs = self._needs(own, target) if self.has_target else ()
             if self.rows != self.size and not hasattr(self.own, "sample"):
                 sizes = f"predict returns {self.size} numbers and residual {self.rows}"
-                raise SensorError(f"sensor '{self.reference}': sample: missing; {sizes}")
+                raise UserCodeError(f"sensor '{self.reference}': sample: missing; {sizes}")
             self.units = self._names("units", ("1",) * self.rows)
             if len(self.units) != self.rows:
-                raise SensorError(f"sensor '{self.reference}': units: {len(self.units)} for {self.rows} rows")
+                raise UserCodeError(f"sensor '{self.reference}': units: {len(self.units)} for {self.rows} rows")
             self._numbers("sample", self.sample(value, 0.1 * np.array(self.noise)))
-            self.sensed(own, target)
             if hasattr(self.own, "jacobian"):
                 self._compare(own, target)
+
+    def _trials(self) -> list[tuple[Placed, Placed]]:
+        """Return random places at which the class measures; the first ones if there are hardly any."""
+        rng = np.random.default_rng(0)
+        pairs = [(placed_at_random(rng), placed_at_random(rng)) for _ in range(PLACES)]
+        return ([pair for pair in pairs if self.sensed(*pair)] or pairs)[:TRIALS]
 
     def _needs(self, own: Placed, target: Placed) -> tuple[str, ...]:
         """Return what is needed of a target beside its position: without it there is no prediction."""
@@ -150,35 +145,29 @@ class OwnKind(Kind):
         return tuple(found)
 
     def _names(self, attribute: str, usual: tuple[str, ...]) -> tuple[str, ...]:
-        """Return an attribute of the class: one text, or several. Raises SensorError: it is something else."""
+        """Return an attribute of the class: one text, or several. Raises UserCodeError: it is something else."""
         given = getattr(self.own, attribute, usual)
         names = (given,) if isinstance(given, str) else given
         if not (isinstance(names, tuple | list) and all(isinstance(name, str) for name in names)):
-            raise SensorError(f"sensor '{self.reference}': {attribute}: expected texts, got {shown(given)}")
+            raise UserCodeError(f"sensor '{self.reference}': {attribute}: expected texts, got {shown(given)}")
         return tuple(names)
 
     def _numbers(self, name: str, value: Any) -> Array:
-        """Return 1 to 6 finite numbers as a vector. Raises SensorError: it is something else."""
-        try:
-            array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            array = np.empty((0, 0))
+        """Return 1 to 6 finite numbers as a vector. Raises UserCodeError: it is something else."""
+        array = as_numbers(value)
         if array.ndim > 1 or not 1 <= array.size <= MOST_ROWS:
-            raise SensorError(f"sensor '{self.reference}': {name}: expected 1 to 6 numbers, got {shown(value)}")
+            raise UserCodeError(f"sensor '{self.reference}': {name}: expected 1 to 6 numbers, got {shown(value)}")
         if not np.isfinite(array).all():
-            raise SensorError(f"sensor '{self.reference}': {name}: not finite: {shown(value)}")
+            raise UserCodeError(f"sensor '{self.reference}': {name}: not finite: {shown(value)}")
         return array.reshape(-1)
 
     def _noise(self) -> tuple[float, ...]:
-        stated = getattr(self.own, "noise", np.nan)
-        try:
-            given = np.atleast_1d(np.asarray(stated, dtype=float))
-        except (TypeError, ValueError):
-            raise SensorError(f"sensor '{self.reference}': noise: expected numbers, got {shown(stated)}") from None
-        noise = np.broadcast_to(given, self.rows) if given.size in (1, self.rows) else np.full(1, np.nan)
+        stated = getattr(self.own, "noise", None)
+        given = np.atleast_1d(as_numbers(stated))
+        noise = np.broadcast_to(given, self.rows) if given.shape in ((1,), (self.rows,)) else np.full(1, np.nan)
         if not (noise > 0.0).all():
             expected = f"one positive number, or {self.rows} of them"
-            raise SensorError(f"sensor '{self.reference}': noise: expected {expected}, got {shown(given.tolist())}")
+            raise UserCodeError(f"sensor '{self.reference}': noise: expected {expected}, got {shown(stated)}")
         return tuple(noise.tolist())
 
     def _compare(self, own: Placed, target: Placed) -> None:
@@ -187,17 +176,26 @@ class OwnKind(Kind):
             off = float(np.abs(given - right).max())
             if not off <= AGREEMENT * max(1.0, float(np.abs(right).max())):
                 row, column = np.unravel_index(np.argmax(np.abs(given - right)), right.shape)
-                raise SensorError(
+                raise UserCodeError(
                     f"sensor '{self.reference}': jacobian by {name}: entry [{row}, {column}] is "
                     f"{given[row, column]:.6g}, by differences {right[row, column]:.6g}"
                 )
 
 
+def as_numbers(value: Any) -> Array:
+    """Return a value as an array of real numbers; an empty one of two axes if it is none."""
+    try:
+        array = np.asarray(value)
+        return array.astype(np.float64, casting="same_kind" if array.dtype.kind != "O" else "unsafe")
+    except (TypeError, ValueError):
+        return np.empty((0, 0))
+
+
 class AnyLandmarks(Landmarks):
-    """Landmarks of every name, at random positions."""
+    """Landmarks of every name, at random positions, some of them from the start on."""
 
     def __init__(self, rng: np.random.Generator) -> None:
-        super().__init__()
+        super().__init__({f"landmark_{n}": rng.uniform(-10.0, 10.0, 3) for n in range(3)})
         self._rng = rng
 
     def __missing__(self, name: str) -> Array:

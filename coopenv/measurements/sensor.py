@@ -68,7 +68,7 @@ def functions_of(number: int) -> WarpFunctions:
     return functions
 
 
-def averaged_std(white: Array, correlated: float, time: float, period: float) -> Array:
+def averaged_std(white: Array, correlated: Array, time: float, period: float) -> Array:
     """Return standard deviations (rows,) of white noise that averages as noise with a correlated part does.
 
     A Gauss-Markov error of correlation time T, sampled every `period` s with r = exp(-period / T), counts in a long

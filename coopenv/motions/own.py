@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from coopenv.base.errors import CoopenvError, shown
+from coopenv.base.errors import UserCodeError, shown
 from coopenv.base.installation import blamed, load_reference
 
 if TYPE_CHECKING:
@@ -51,20 +51,20 @@ class OwnDrive:
         Raises:
             CoopenvError: the class cannot be loaded, fails, or lacks columns, `start` or `step`.
         """
-        self._where = f"dynamics.model: {limits.model}"
+        self.where = f"dynamics.model: {limits.model}"
         kind = load_reference(limits.model)
-        with blamed(self._where):
+        with blamed(self.where, UserCodeError):
             self._made = kind(limits)
         for name in ("start", "step"):
             if not callable(getattr(self._made, name, None)):
-                raise CoopenvError(f"{self._where}: has no method {name}(), see docs/contributing/vehicle.md")
+                raise UserCodeError(f"{self.where}: has no method {name}(), see docs/contributing/vehicle.md")
         self.columns = self._checked_columns(getattr(self._made, "columns", None))
         """Two or three; the second and the third are symmetric."""
 
     def _checked_columns(self, rows: Any) -> tuple[CommandColumn, ...]:
-        where = f"{self._where}: columns"
+        where = f"{self.where}: columns"
         if not isinstance(rows, list | tuple) or len(rows) not in (2, 3):
-            raise CoopenvError(f"{where}: expected two or three rows (name, unit, low, high), got {shown(rows)}")
+            raise UserCodeError(f"{where}: expected two or three rows (name, unit, low, high), got {shown(rows)}")
         found: list[CommandColumn] = []
         for row in rows:
             try:
@@ -75,7 +75,7 @@ class OwnDrive:
                 valid = False
             if not valid or (found and column.low != -column.high):
                 span = "low = -high" if found else "low < high"
-                raise CoopenvError(f"{where}: expected (name, unit, low, high) with {span}, got {shown(row)}")
+                raise UserCodeError(f"{where}: expected (name, unit, low, high) with {span}, got {shown(row)}")
             found.append(column)
         return tuple(found)
 
@@ -101,19 +101,19 @@ class OwnDrive:
             return np.zeros((0, BOX))
         boxes = self._numbers("bodies", None, self._made.bodies, state)
         if boxes.ndim != 2 or boxes.shape[1] != BOX:
-            raise CoopenvError(f"{self._where}: bodies: expected shape (K, {BOX}), got {boxes.shape}")
+            raise UserCodeError(f"{self.where}: bodies: expected shape (K, {BOX}), got {boxes.shape}")
         return boxes
 
     def _numbers(self, method: str, shape: tuple[int, ...] | None, call: Any, *given: np.ndarray) -> np.ndarray:
         import numpy as np
 
-        where = f"{self._where}: {method}"
-        with blamed(where):
+        where = f"{self.where}: {method}"
+        with blamed(where, UserCodeError):
             found = np.array(call(*(np.array(part) for part in given)), dtype=float)
         if method == "start" and (found.ndim != 1 or len(found) < len(POSE)):
-            raise CoopenvError(f"{where}: expected a state (n,) that begins with {', '.join(POSE)}, got {found.shape}")
+            raise UserCodeError(f"{where}: expected a state (n,) that begins with {', '.join(POSE)}, got {found.shape}")
         if shape is not None and found.shape != shape:
-            raise CoopenvError(f"{where}: expected shape {shape}, got {found.shape}")
+            raise UserCodeError(f"{where}: expected shape {shape}, got {found.shape}")
         if not np.isfinite(found).all():
-            raise CoopenvError(f"{where}: expected finite numbers, got {shown(found.tolist())}")
+            raise UserCodeError(f"{where}: expected finite numbers, got {shown(found.tolist())}")
         return found

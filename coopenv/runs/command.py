@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
 
-from coopenv.base.errors import CoopenvError, DataError, explained, listed
+from coopenv.base.errors import CoopenvError, DataError, UserCodeError, explained, listed
 from coopenv.base.files import replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import install_command
@@ -21,7 +21,6 @@ from coopenv.episode import OF_TRAJECTORY, RECORDED, SCENE_FILE
 from coopenv.estimation.metrics import shown_note, shown_vehicles, steady_start
 from coopenv.estimation.observability import Observability, analyse_observability
 from coopenv.estimation.trajectory import Trajectory
-from coopenv.measurements.own import SensorError
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import states_covariance, with_observer
 from coopenv.policies import Policy
@@ -75,7 +74,7 @@ def execute(
 
     Raises:
         CoopenvError: an argument is not valid, or the results cannot be written.
-        SensorError: a user's sensor has failed; the results up to then are written.
+        UserCodeError: a user's sensor has failed; the results up to then are written.
     """
     scenario = run.scenario
     if run.policy_name not in ("zero", "recorded") and not scenario.driven:
@@ -132,7 +131,7 @@ def _played(
             if tick % stride == 0:
                 progress.update(tick, describe() if describe is not None else None)
     except CoopenvError as error:
-        if not isinstance(error, SensorError) and not isinstance(error.__cause__, SensorError):
+        if not isinstance(error, UserCodeError) and not isinstance(error.__cause__, UserCodeError):
             raise
         return error
     return None

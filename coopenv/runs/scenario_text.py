@@ -196,8 +196,8 @@ def sensor_row(section: SensorSection) -> tuple[str, ...]:
         ),
         ", ".join(stds),
         lines(
-            section.bias and f"bias {number(section.bias)}{unit}",
-            correlated.std and f"{number(correlated.std)}{unit}, correlated over {number(correlated.time)} s",
+            section.bias and f"bias {setting(section.bias)}{unit}",
+            correlated.std and f"{setting(correlated.std)}{unit}, correlated over {number(correlated.time)} s",
             outages.rate and f"{number(60.0 * outages.rate)} outages a minute of {number(outages.duration)} s",
             section.miss_probability and f"{number(100.0 * section.miss_probability)} % missed",
             section.outliers.probability and f"{number(100.0 * section.outliers.probability)} % outliers",

@@ -225,10 +225,11 @@ def describe_scenario(scenario: Scenario) -> Iterator[RenderableType]:
         yield listing
         yield ""
     yield Text("Settings (* differs from the default)\n", "bold")
-    names = shown_sections(scenario)
-    width = max(len(key) for name in names for key, *_ in settings(getattr(scenario, name))) + 2
-    for name in names:
-        yield section_table(name, getattr(scenario, name), width)
+    parts = {name: getattr(scenario, name) for name in shown_sections(scenario)}
+    parts |= {f"sensors.{sensor.label}": sensor for sensor in scenario.sensors}
+    width = max(len(key) for part in parts.values() for key, *_ in settings(part)) + 2
+    for name, part in parts.items():
+        yield section_table(name, part, width)
         yield ""
     layout = observation_layout(scenario)
     rows = [

@@ -504,6 +504,8 @@ def _doubts(s: Scenario, neighbours: Sequence[Sequence[int]]) -> Iterator[str]:
     if s.sensors and s.observer.name in BEARINGS_ALONE:
         ignored = listed([sensor.label for sensor in s.sensors])
         yield f"observer '{s.observer.name}' takes the camera's bearings alone and ignores {ignored}"
+    for sensor in [sensor for sensor in s.sensors if (sensor.rate or 0.0) > s.rates.camera]:
+        yield f"sensors.{sensor.label}.rate: {sensor.rate:g} Hz is above rates.camera, {s.rates.camera:g} Hz"
     for landmark in s.landmarks if s.observer.name == "riccati" else ():
         distance = float(np.linalg.norm(np.array(landmark.position) - np.array(s.map.origin)))
         if distance > FAR_FROM_ORIGIN:

@@ -22,13 +22,15 @@ if TYPE_CHECKING:
 GROUPS = ("landmarks", "vehicles", "anchors", "map")
 """Targets of a sensor, beside single landmarks and vehicles by name."""
 MOST_SENSORS = 16
+ByRow = NonNegative | tuple[NonNegative, ...]
+"""A number for every row of a measurement, or one for each."""
 
 
 class Correlated(Section):
     """An error that changes slowly, as by multipath: a Gauss-Markov process of first order in each row."""
 
-    std: NonNegative = 0.0
-    """Standard deviation, in the units of the noise."""
+    std: ByRow = 0.0
+    """Standard deviation of every row, or one for each, in the units of the noise."""
     time: Annotated[Positive, units.TIME] = 10.0
     """Correlation time, s."""
 
@@ -46,8 +48,8 @@ class Outliers(Section):
     """Measurements that are wrong, as a range by a reflection; drawn per target and measurement."""
 
     probability: units.Chance = 0.0
-    size: NonNegative = 5.0
-    """Mean of an exponentially distributed error, in the units of the noise; it is added to every row."""
+    size: ByRow = 5.0
+    """Mean of an exponentially distributed error that is added to every row, or one for each, in their units."""
 
 
 class SensorSection(Section):
@@ -67,7 +69,7 @@ class SensorSection(Section):
     position: Annotated[Vector3, units.LENGTH] = (0.0, 0.0, 0.0)
     """Place in the body frame, m."""
     orientation: Literal["body"] | QuaternionWxyz = "body"
-    """Sensor to body: `body` has the body's own axes, x forward."""
+    """Sensor to body: `body` has the body's own axes, x forward; or a quaternion [w, x, y, z]."""
     noise: Positive | tuple[Positive, ...] | None = None
     """Standard deviation of every row, or one for each (default: the kind's own)."""
     range: Annotated[Positive | None, units.DISTANCE] = None
@@ -78,8 +80,8 @@ class SensorSection(Section):
     """Whether buildings and bodies hide a target behind them, and buildings above a receiver of `position` the sky."""
     miss_probability: units.Chance = 0.0
     """Chance that a measurement is lost, drawn per target and measurement."""
-    bias: NonNegative = 0.0
-    """Standard deviation of a constant error of every row, drawn per vehicle and episode."""
+    bias: ByRow = 0.0
+    """Standard deviation of a constant error of every row, or one for each, drawn per vehicle and episode."""
     correlated: Correlated = Correlated()
     outages: Outages = Outages()
     outliers: Outliers = Outliers()
@@ -98,21 +100,25 @@ class SensorSection(Section):
 
         return kept_kind(self.kind, self.arguments)
 
+    def by_row(self, key: str, given: float | Sequence[float]) -> "Array":
+        """Return the numbers of a key, (rows,). Raises CoopenvError: there are not as many as rows."""
+        numbers, rows = np.atleast_1d(np.array(given, float)), self.made.rows
+        if len(numbers) not in (1, rows):
+            raise CoopenvError(f"sensors.{self.label}.{key}: {len(numbers)} numbers for {rows} rows")
+        return np.broadcast_to(numbers, rows)
+
     @property
     def white(self) -> "Array":
         """(rows,) standard deviations of white noise. Raises CoopenvError: there are not as many as rows."""
-        rows = self.made.rows
-        given = np.atleast_1d(np.array(self.made.noise if self.noise is None else self.noise, float))
-        if len(given) not in (1, rows):
-            raise CoopenvError(f"sensors.{self.label}.noise: {len(given)} numbers for {rows} rows")
-        return np.broadcast_to(given, rows)
+        return self.by_row("noise", self.made.noise if self.noise is None else self.noise)
 
     def counted(self, camera: float) -> "Array":
         """Return standard deviations (rows,) by which filters count its noise; `camera` is the rate of ticks, Hz."""
         period = 1.0 / min(self.rate or math.inf, camera)
         from coopenv.measurements.sensor import averaged_std
 
-        return averaged_std(self.white, self.correlated.std, self.correlated.time, period)
+        correlated = self.by_row("correlated.std", self.correlated.std)
+        return averaged_std(self.white, correlated, self.correlated.time, period)
 
     @property
     def mounting(self) -> "Array":

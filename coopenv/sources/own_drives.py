@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import UserCodeError, listed
 from coopenv.estimation.poses import Array
 from coopenv.motions.command import LATERAL, SPEED, TURN
 from coopenv.motions.own import BOX, OwnDrive
@@ -69,7 +69,8 @@ class OwnDrives(TrafficProgram):
             turn[i] = self._drives[i].turn(state, float(now.command[i, TURN]))
             boxes += [*self._drives[i].bodies(state)]
         if len(boxes) > self._boxes:
-            raise CoopenvError(f"dynamics.model: bodies: {len(boxes)} boxes, and {self._boxes} at the start")
+            where = listed([*dict.fromkeys(drive.where for drive in self._drives.values())])
+            raise UserCodeError(f"{where}: bodies: {len(boxes)} boxes, and {self._boxes} at the start")
         self._set(xy, heading, speed, turn, driven, boxes)
 
     def _set(self, xy: Array, heading: Array, speed: Array, turn: Array, driven: Array, boxes: list[Array]) -> None:

@@ -81,8 +81,16 @@ def read_log(name: str | Path, data: str | Path | None, variant: str | None) -> 
     return read_recording(name)
 
 
-OWN_KIND = re.compile(r"sensors\.\w+\.kind")
+OWN_KIND = re.compile(r"sensors\.(\w+)\.kind")
 """Override of a recording that names the class of one of its sensors."""
+
+
+def allow_kinds(overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Let recordings name the classes of sensors that overrides name, and return the other overrides."""
+    rest = dict(overrides)
+    for key in [key for key in overrides if OWN_KIND.fullmatch(key)]:
+        allow(absolute_reference(str(rest.pop(key))))
+    return rest
 
 
 def replay_of(
@@ -95,10 +103,12 @@ def replay_of(
     """Return the replay of a recording by its name; arguments and errors as for `open_recording`."""
     from coopenv.sources.worlds import Replay
 
-    rest = dict(overrides)
-    for key in [key for key in overrides if OWN_KIND.fullmatch(key)]:
-        allow(absolute_reference(str(rest.pop(key))))
-    return Replay(open_recording(name, data, variant, selection), Path(name).name, rest)
+    rest = allow_kinds(overrides)
+    recording = open_recording(name, data, variant, selection)
+    sensors = {sensor.name for setup in recording.setups for sensor in setup.sensors}
+    for named in filter(None, map(OWN_KIND.fullmatch, overrides)):
+        check_one_of(f"{name}: {named[0]}: unknown sensor", named[1], sorted(sensors))
+    return Replay(recording, Path(name).name, rest)
 
 
 def open_simulation(name_or_path: ScenarioLike, overrides: Mapping[str, Any] | None = None) -> Scenario:

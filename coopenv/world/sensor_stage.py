@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import CoopenvError, UserCodeError
 from coopenv.measurements.kinds import MOST_ROWS, Landmarks, Placed
-from coopenv.measurements.own import SensorError
 from coopenv.measurements.sensor import Sensor
 from coopenv.scenario.sensors import SensorSection
 from coopenv.world.embedded import Nothing
@@ -93,7 +92,7 @@ class SensorStage:
         noise = self._drawn.noise.numpy()[w, i, d, target, : kind.rows].astype(float)
         values = kind.sample(kind.predict(*self._places(w, d, i, target)), noise)
         if not np.isfinite(values).all():
-            raise SensorError(f"sensor '{self._sensors[d].reference}': predict: not finite")
+            raise UserCodeError(f"sensor '{self._sensors[d].reference}': predict: not finite")
         self._state.reading.numpy()[w, i, d, target] = np.pad(values, [(0, 0), (0, MOST_ROWS - kind.size)])
         self._state.reading_tick.numpy()[w, i, d, target] = tick
 

@@ -6,12 +6,14 @@ kernel writes which targets are measured, and the noise.
 """
 
 import math
+import warnings
 from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from coopenv.base.errors import ScenarioWarning, listed
 from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array
 from coopenv.measurements.bearing import Bearing
@@ -48,7 +50,7 @@ def sensor_entries(section: SensorSection, scenario: Scenario) -> dict[str, Any]
     kind, on, camera = section.made, float(scenario.noise.enabled), scenario.rates.camera
     outages, correlated, outliers = section.outages, section.correlated, section.outliers
     begin, end = outages.rate, 1.0 / outages.duration
-    rows = np.arange(MOST_ROWS) < kind.rows
+    unused = (0, MOST_ROWS - kind.rows)
     return {
         "rotation": section.mounting,
         "position": section.position,
@@ -56,13 +58,13 @@ def sensor_entries(section: SensorSection, scenario: Scenario) -> dict[str, Any]
         "rows": kind.rows,
         "has_target": kind.has_target,
         "ratio": min(1.0, (section.rate or camera) / camera),
-        "std": on * np.pad(section.white, (0, MOST_ROWS - kind.rows)),
-        "counted": on * np.pad(section.counted(camera), (0, MOST_ROWS - kind.rows)),
+        "std": on * np.pad(section.white, unused),
+        "counted": on * np.pad(section.counted(camera), unused),
         "weight": _weights(section, scenario),
-        "bias": on * section.bias * rows,
-        "correlated": on * correlated.std * rows,
+        "bias": on * np.pad(section.by_row("bias", section.bias), unused),
+        "correlated": on * np.pad(section.by_row("correlated.std", correlated.std), unused),
         "correlation": math.exp(-1.0 / (camera * correlated.time)),
-        "outlier": on * outliers.size * rows,
+        "outlier": on * np.pad(section.by_row("outliers.size", outliers.size), unused),
         "outlier_probability": outliers.probability,
         "miss_probability": section.miss_probability,
         "outage_share": begin / (begin + end),
@@ -83,10 +85,13 @@ def _weights(section: SensorSection, scenario: Scenario) -> Array:
 def sensor_tables(scenario: Scenario) -> dict[str, Any]:
     """Return the model's arrays of which vehicles have which sensors, and which agents these measure."""
     sensors, names, targets = scenario.sensors, scenario.vehicle_names, range(len(scenario.target_names))
-    return {
-        "carries": [[section.is_on(name) for section in sensors] for name in names],
-        "measures": [[section.measures(scenario, target) for target in targets] for section in sensors],
-    }
+    measures = [[section.measures(scenario, target) for target in targets] for section in sensors]
+    for section, row in zip(sensors, measures, strict=True):
+        if section.made.has_target and not any(row):
+            towards = listed(section.made.towards if section.towards is None else section.towards)
+            text = f"sensors.{section.label}.towards: no landmark or vehicle is among {towards}: it measures nothing"
+            warnings.warn(text, ScenarioWarning, stacklevel=2)
+    return {"carries": [[section.is_on(name) for section in sensors] for name in names], "measures": measures}
 
 
 @wp.func
@@ -118,7 +123,7 @@ def carry_errors(model: Any, state: Any, world: int, vehicle: int, sensor: int, 
     zero = like.dtype(0.0)
     seed = state.seed[world]
     episode = state.episode[world]
-    if own.correlated[0] > zero:
+    if wp.length_sq(own.correlated) > zero:
         fresh = six_normals(state, world, tick, vehicle, stream_of(sensor, DRIFT), like, own.std)
         keeps = wp.where(tick == 0, zero, own.correlation)
         step = wp.cw_mul(own.correlated, fresh) * wp.sqrt(one - keeps * keeps)
@@ -189,7 +194,7 @@ def noise_of(model: Any, state: Any, world: int, vehicle: int, sensor: int, targ
     subject = pair(vehicle, target)
     white = six_normals(state, world, tick, subject, stream_of(sensor, WHITE), like, own.std)
     noise = wp.cw_mul(own.std, white) + state.sensor_drift[world, vehicle, sensor]
-    if own.bias[0] > one - one:
+    if wp.length_sq(own.bias) > one - one:
         noise += wp.cw_mul(own.bias, six_normals(state, world, 0, vehicle, stream_of(sensor, BIAS), like, own.std))
     if own.outlier_probability > one - one:
         words = random_words(state.seed[world], state.episode[world], tick, subject, stream_of(sensor, DETECTION))

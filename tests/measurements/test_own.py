@@ -83,10 +83,10 @@ def test_a_class_with_every_function_is_used_with_each_of_them(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("body", "problem"),
     [
-        ([RANGE], "noise: expected one positive number, or 1 of them, got [nan]"),
-        (["noise = 'much'", RANGE], "noise: expected numbers, got 'much'"),
-        (["noise = 0.0", RANGE], "noise: expected one positive number, or 1 of them, got [0.0]"),
-        (["noise = 0.1, 0.1", RANGE], "noise: expected one positive number, or 1 of them, got [0.1, 0.1]"),
+        ([RANGE], "noise: expected one positive number, or 1 of them, got None"),
+        (["noise = 'much'", RANGE], "noise: expected one positive number, or 1 of them, got 'much'"),
+        (["noise = 0.0", RANGE], "noise: expected one positive number, or 1 of them, got 0.0"),
+        (["noise = 0.1, 0.1", RANGE], "noise: expected one positive number, or 1 of them, got (0.1, 0.1)"),
         (["noise = 0.1"], "expected a class with predict(own, target), got <class"),
         (["noise = 0.1", "def predict(self, own): return 1.0"], "predict: TypeError: "),
         (
@@ -102,14 +102,23 @@ def test_a_class_with_every_function_is_used_with_each_of_them(tmp_path: Path) -
         (["noise = 0.1", "def predict(self, own, target): return np.ones(7)"], "predict: expected 1 to 6 numbers, got"),
         (["noise = 0.1", "def predict(self, own, target): return np.nan"], "predict: not finite: nan"),
         (["noise = 0.1", "def predict(self, own, target): return own.speed"], "predict: AttributeError: "),
-        (["noise = 0.1", RANGE, "def residual(self, a, b): return None"], "residual: not finite: None"),
+        (
+            ["noise = 0.1", RANGE, "def residual(self, a, b): return None"],
+            "residual: not finite: None",
+        ),
         (["noise = 0.1", RANGE, "def residual(self, a, b): raise OSError('no')"], "residual: OSError: no"),
         (
             ["noise = 0.1", RANGE, "def sample(self, a, b): return 1.0, 2.0"],
             "sample: expected shape (1,), got (1.0, 2.0)",
         ),
         (["noise = 0.1", RANGE, "def sample(self, a, b): return np.nan"], "sample: not finite: array([nan])"),
+        (["noise = 0.1", "def predict(self, own, target): return 1j"], "predict: expected 1 to 6 numbers, got 1j"),
+        (["noise = 0.1", "def predict(self, own, target): raise SystemExit(3)"], "predict: SystemExit: 3"),
         (["noise = 0.1", RANGE, "def sensed(self, own): return True"], "sensed: TypeError: "),
+        (
+            ["noise = 0.1", RANGE, "def sensed(self, own, target): return target.position > 0"],
+            "sensed: expected shape (1,), got array(",
+        ),
         (["noise = 0.1", RANGE, "units = 'm', 'm'"], "units: 2 for 1 rows"),
         (["noise = 0.1", RANGE, "units = 1"], "units: expected texts, got 1"),
         (["noise = 0.1", RANGE, "towards = ('map', 3)"], "towards: expected texts, got ('map', 3)"),
@@ -178,3 +187,22 @@ def test_a_class_is_loaded_again_after_its_file_has_changed(tmp_path: Path) -> N
     written(tmp_path, "noise = 0.25", RANGE)
     os.utime(tmp_path / "mine.py", ns=(1, 1))
     assert kept_kind(reference, "{}").noise == (0.25,)
+
+
+def test_a_class_is_tried_only_where_it_measures(tmp_path: Path) -> None:
+    kind = kind_of(
+        written(
+            tmp_path,
+            "noise = 0.1",
+            "def predict(self, own, target):",
+            "    if own.position[0] < 0: raise IndexError('outside the chart')",
+            "    return min(np.linalg.norm(own.position - at) for at in own.landmarks.values())",
+            "def sensed(self, own, target): return own.position[0] > 0",
+        )
+    )
+    assert kind.rows == 1
+
+
+def test_numbers_of_different_units_are_parts_of_their_own(tmp_path: Path) -> None:
+    body = "noise, units = 0.1, ('rad', 'm/s')", "def predict(self, own, target): return own.position[:2]"
+    assert kind_of(written(tmp_path, *body)).parts == (("1", 1, "rad"), ("2", 1, "m/s"))

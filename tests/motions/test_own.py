@@ -11,6 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
+import coopenv
 from coopenv import make_vec, parallel_env
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
@@ -208,6 +209,17 @@ def test_a_wrong_class_is_one_line(folder: Path, place: str) -> None:
         engine.step(np.ones((1, 2, 2)))
     text = str(caught.value)
     assert text.startswith("dynamics.model: ") and "mine.py:Trailer" in text and line in text and "\n" not in text
+
+
+def test_a_run_whose_drive_fails_keeps_what_it_has(folder: Path) -> None:
+    failing = TRAILER.replace("trailer += ", "assert x < 0.3, 'stuck'; trailer += ")
+    (folder / "mine.py").write_text(failing, encoding="utf-8")
+    with pytest.raises(
+        CoopenvError, match=r"mine\.py:Trailer: step failed at .*stuck \(the .* s before it are in out\)"
+    ):
+        coopenv.run(towing(), policy="zero", out="out")
+    with np.load(folder / "out" / "trajectory.npz") as arrays:
+        assert arrays["position"][-1, 0, 0] == pytest.approx(0.3, abs=0.1)
 
 
 def test_a_class_that_is_not_there_is_one_line(folder: Path) -> None:

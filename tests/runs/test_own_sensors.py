@@ -192,6 +192,7 @@ def test_a_run_whose_sensor_fails_keeps_what_it_has(tmp_path: Path, failure: str
         ({"kind": "sonar"}, r"sensors\.0.*kind: unknown kind of sensor 'sonar'"),
         ({"kind": "none.py:Mine"}, r"sensors\.0.*kind: '.*none\.py:Mine': no such file"),
         ({"noise": [0.1, 0.2]}, r"sensors\.failing\.noise: 2 numbers for 1 rows"),
+        ({"bias": [0.1, 0.2]}, r"sensors\.failing\.bias: 2 numbers for 1 rows"),
         ({"noise": -1.0}, r"sensors\.0\.noise"),
         ({"noise": "nan"}, r"sensors\.0\.noise"),
         ({"options": {"reach": 1.0}}, r"mine\.py:Failing': its start: TypeError: Failing"),

@@ -15,6 +15,8 @@ from numpy.testing import assert_array_equal
 
 from coopenv import CoopenvError, DataError
 from coopenv.api.engine import Engine
+from coopenv.bench.observers.sources import find_source
+from coopenv.cli.app import main
 from coopenv.measurements import named
 from coopenv.measurements.sensor import MAP, Sensor
 from coopenv.measurements.table import KINDS
@@ -111,8 +113,26 @@ def test_a_log_runs_no_class_that_its_user_has_not_named(tmp_path: Path, monkeyp
     monkeypatch.setattr(named, "_references", {})
     with pytest.raises(DataError, match=r"drive\.mcap.*--set sensors\.height\.kind=hers\.py:Height"):
         read_recording(path)
+    with pytest.raises(CoopenvError, match=r"drive\.mcap: sensors\.hight\.kind: unknown sensor 'hight'.*'height'"):
+        open_backend(str(path), None, {"sensors.hight.kind": f"{own}:Height"})
     replay = open_backend(str(path), None, {"sensors.height.kind": f"{own}:Height"})
     assert [section.label for section in replay.scenario.sensors] == ["height"]
+
+
+def test_a_log_is_compared_and_recorded_again_with_the_class_that_its_user_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("mcap", reason="needs the extra 'log'")
+    path, again = tmp_path / "drive.mcap", tmp_path / "again.mcap"
+    write_recording(record(described(sensors=[{"kind": DOPPLER, "name": "radar"}])), path)
+    monkeypatch.setattr(named, "_references", {})
+    change = f"sensors.radar.kind={DOPPLER}"
+    with pytest.raises(CoopenvError, match=r"overrid.*is recorded"):
+        find_source(path, {"noise.enabled": False})
+    assert main(["record", str(path), "--out", str(again), "--no-replay", "--set", change]) == 0
+    monkeypatch.setattr(named, "_references", {})
+    source = find_source(path, dict([change.split("=")]))
+    assert_array_equal(source.recording("nominal", 0).readings["radar"], read_recording(again).readings["radar"])
 
 
 def test_the_state_of_a_replay_holds_the_readings_of_each_tick() -> None:

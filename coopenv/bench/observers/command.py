@@ -14,7 +14,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import CoopenvError, listed
 from coopenv.base.files import replace_text, replacing_folder
 from coopenv.base.format import json_text, jsonable, with_error
 from coopenv.base.installation import versions
@@ -35,6 +35,7 @@ from coopenv.estimation.metrics import CONVERGED
 from coopenv.report.table import Table
 from coopenv.report.templates import templates
 from coopenv.runs.console import Progress, note_overwritten
+from coopenv.scenario.schema import BEARINGS_ALONE
 from coopenv.viz import FORMATS
 
 JSON_FILE, CSV_FILE, REPORT_FILE, BASIN_FILE = "leaderboard.json", "leaderboard.csv", "report.html", "basin.csv"
@@ -81,6 +82,8 @@ def perform(
             note_overwritten(out, names, log)
             for name, reason in plan.left_out.items():
                 log.print(f"left out: {name} ({reason})", soft_wrap=True, markup=False)
+            if plan.source.sensor_sets and (ignoring := [name for name in plan.observers if name in BEARINGS_ALONE]):
+                log.print(f"note: {listed(ignoring)}: bearings of the camera alone, other sensors are ignored")
             with Progress(log, plan.work, total=1.0) as progress:
                 found = plan.run(executor, progress.update)
             if basin:

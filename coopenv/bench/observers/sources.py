@@ -35,7 +35,7 @@ from coopenv.scenario import Scenario, ScenarioLike, load_scenario, scenario_nam
 from coopenv.sources.base import Backend
 from coopenv.sources.registry import ENVIRONMENT, kind_of
 from coopenv.sources.selection import WHOLE, Selection
-from coopenv.sources.sources import OBJECT, is_recording, open_backend, open_recording
+from coopenv.sources.sources import OBJECT, allow_kinds, is_recording, open_backend, open_recording
 
 already_warned = partial(warnings.catch_warnings, action="ignore", category=DataWarning)
 """Silences the warnings on recorded data that `Source.check` has given."""
@@ -163,6 +163,8 @@ class GivenRecord(RecordSource):
 
     given: Recording | Path = field(repr=False)
     selection: Selection = WHOLE
+    kinds: Mapping[str, str] = field(default_factory=dict)
+    """Overrides that name the classes of its sensors."""
 
     def world(self) -> Recording:
         """Return the record."""
@@ -174,6 +176,7 @@ class GivenRecord(RecordSource):
         return self.fault(variant).applied(self.selection.applied(whole, self.name), seed)
 
     def _whole(self) -> Recording:
+        allow_kinds(self.kinds)
         return open_recording(self.given) if isinstance(self.given, Path) else self.given
 
 
@@ -276,6 +279,8 @@ def find_source(
             load_policy(policy, scenario, 0)
         return SimulatedRecords(scenario_name(text), scenario, policy or "zero", added=worlds)
     ticks = kind is not ENVIRONMENT and not kind.reader
+    kinds = dict(overrides or {})
+    overrides = kinds if ticks else allow_kinds(kinds)
     path = Path(str(text))
     folder, topic_map = (None if given is None else Path(given) for given in (data, topics))
     refused = {
@@ -298,7 +303,7 @@ def find_source(
     if kind.comparison:
         made: RecordSource = call(kind.comparison, str(text), folder, selection)
         return made
-    return GivenRecord(path.stem, path, selection, added=added)
+    return GivenRecord(path.stem, path, selection, kinds, added=added)
 
 
 def with_sensor_sets(source: RecordSource) -> RecordSource:
