@@ -252,7 +252,7 @@ def memory_struct(entries: str, of_reading: Any, name: str = "RobustMemory") -> 
     Args:
         entries: the axis of a frame's measurements, F; or X where all of them are bearings of the camera.
         of_reading: the struct of what a measurement of another sensor has beside; `Nothing` without any.
-        name: of the struct; functions tell structs with the same fields apart by it.
+        name: of the struct: structs with the same fields differ by it.
     """
 
     class RobustMemory:

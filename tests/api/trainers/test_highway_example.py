@@ -1,4 +1,4 @@
-"""`examples/highway_policy.py` trains, keeps weights that are read without running code, and prints its table."""
+"""The example `highway_policy.py` trains, keeps weights that are read without running code, and prints its table."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.train
 
 @pytest.fixture(scope="module")
 def example() -> ModuleType:
-    return four_way.example("highway_policy")
+    return four_way.example("trainers/highway_policy")
 
 
 def test_the_example_prints_the_cost_of_errors(

@@ -1,7 +1,7 @@
 """Cost of localisation errors to a policy of highway-env: train it on the truth, run it on estimates.
 
-Run: python examples/highway_policy.py           (five minutes on one core; the policy is kept in out/highway_policy.pt)
-     python examples/highway_policy.py --quick   (half a minute, a policy that has hardly learnt)
+Run: python examples/trainers/highway_policy.py           (five minutes on one core; keeps out/highway_policy.pt)
+     python examples/trainers/highway_policy.py --quick   (half a minute, a policy that has hardly learnt)
 
 Needs the extras `highway` and `train`. A DQN of Stable-Baselines3 learns on plain `intersection-v0`, where it sees true
 kinematics. Then the same episodes are driven four times: on the truth, and wrapped in `EstimatedKinematics` with ideal,
@@ -18,14 +18,13 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import torch
+from estimated_kinematics import EstimatedKinematics
 from highway_env.envs.intersection_env import IntersectionEnv
 from rich.console import Console
 from rich.table import Table
 from scipy.stats import binomtest, t
 from stable_baselines3 import DQN
 from stable_baselines3.common.monitor import Monitor
-
-from coopenv.api.highway import EstimatedKinematics
 
 ARMS = ("truth", "ideal", "sensed", "blind")
 

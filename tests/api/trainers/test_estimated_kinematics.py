@@ -13,12 +13,11 @@ from coopenv import CoopenvError
 
 pytest.importorskip("highway_env", reason="needs the extra highway")
 
+from estimated_kinematics import EstimatedKinematics
 from gymnasium.utils.env_checker import check_env
 from highway_env.envs.highway_env import HighwayEnv
 from highway_env.envs.intersection_env import IntersectionEnv, MultiAgentIntersectionEnv
 from highway_env.envs.roundabout_env import RoundaboutEnv
-
-from coopenv.api.highway import EstimatedKinematics
 
 PLAIN = [(IntersectionEnv, "highway_intersection"), (RoundaboutEnv, "highway_roundabout")]
 EXACT = {
