@@ -171,7 +171,7 @@ def _sensors(targets: NDArray[np.int64]) -> tuple[Sensor, ...]:
     floor, the_map = np.full(3, FLOOR_STD), np.array([MAP])
     distance = Sensor("range", "range", np.array([RANGE_STD]), targets, *place)
     return (
-        replace(distance, std_by_distance=RANGE_STD_BY_DISTANCE, bias=RANGE_BIAS, scale=RANGE_SCALE_STD),
+        replace(distance, std_by_distance=RANGE_STD_BY_DISTANCE, bias=(RANGE_BIAS,), scale=RANGE_SCALE_STD),
         Sensor("level", "attitude", np.where([False, False, True], UNKNOWN_STD, floor), the_map, *place),
         Sensor("height", "position", np.where([True, True, False], UNKNOWN_STD, floor), the_map, *place),
     )

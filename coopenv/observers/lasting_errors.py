@@ -44,8 +44,8 @@ class LastingErrors:
             noise.odometry_lead,
         )
         std[ORIENTATION] = noise.camera_orientation
-        self.of_sensors = {n: sensor.kind.rows for n, sensor in enumerate(sensors) if sensor.bias or sensor.scale}
-        declared = [[*[sensors[n].bias] * rows, sensors[n].scale] for n, rows in self.of_sensors.items()]
+        self.of_sensors = {n: sensor.kind.rows for n, sensor in enumerate(sensors) if any(sensor.bias) or sensor.scale}
+        declared = [[*(sensors[n].bias or np.zeros(rows)), sensors[n].scale] for n, rows in self.of_sensors.items()]
         std = np.concatenate([std, *declared])
         self.count = len(std)
         walk = np.pad(walk, (0, self.count - STATES))

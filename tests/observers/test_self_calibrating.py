@@ -108,7 +108,7 @@ def test_without_lasting_errors_and_messages_it_is_the_schmidt_filter() -> None:
 def test_bias_and_scale_of_ranges_are_estimated() -> None:
     """A still vehicle with true ranges to four landmarks, made wrong by a known bias and scale."""
     landmarks = np.array([[3.0, 0.0, 1.0], [0.0, 4.0, 0.5], [-6.0, 1.0, 0.0], [1.0, -7.0, 2.0]])
-    sensor = Sensor("range", "range", np.array([0.01]), np.arange(4), np.zeros(3), np.eye(3), bias=0.3, scale=0.1)
+    sensor = Sensor("range", "range", np.array([0.01]), np.arange(4), np.zeros(3), np.eye(3), bias=(0.3,), scale=0.1)
     bearings = landmarks / np.linalg.norm(landmarks, axis=1)[:, None]
     wrong = 1.05 * np.linalg.norm(landmarks, axis=1) + 0.2
     zero, K = np.zeros((40, 1, 3)), 40
@@ -202,7 +202,7 @@ class PlanarOracle:
         self.noise, self.values = recording.setups[i].noise, np.zeros(8)
         n, distance = self.noise, recording.setups[i].sensors[0]
         of_wheels = [n.odometry_scale, n.turn_scale, n.curvature, n.turning_loss, n.odometry_lead]
-        of_errors = [*of_wheels, n.camera_orientation, distance.bias, distance.scale]
+        of_errors = [*of_wheels, n.camera_orientation, *distance.bias, distance.scale]
         start = np.sqrt(np.diag(recording.start_covariance[i])[[2, 3, 4]])
         self.P = np.diag(np.square([*start, *of_errors]))
         self.before = np.zeros(3)  # rad/s, m/s, m/s
