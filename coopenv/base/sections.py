@@ -5,7 +5,7 @@ import inspect
 import math
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from difflib import get_close_matches
 from functools import cache, reduce
@@ -173,23 +173,6 @@ def toml_of(text: str) -> dict[str, Any]:
     if keys > MOST_KEYS:
         raise ValueError(f"its keys have {keys:,} parts, more than {MOST_KEYS:,}")
     return tomllib.loads(text)
-
-
-def with_tables(
-    raw: Mapping[str, Any], more: Mapping[str, Any], keys: Sequence[str], where: str, error: type[CoopenvError]
-) -> dict[str, Any]:
-    """Return plain data with the entries of tables of another file added, `where` both are named.
-
-    Raises:
-        CoopenvError: of class `error`; one of them is no table.
-    """
-    joined = dict(raw)
-    for key in keys:
-        own, other = raw.get(key, {}), more.get(key, {})
-        if not (isinstance(own, Mapping) and isinstance(other, Mapping)):
-            raise error(f"{where}: {key}: expected a table")
-        joined[key] = {**own, **other}
-    return joined
 
 
 def validated(model: type[Model], raw: Any, where: str, error: type[CoopenvError] = CoopenvError) -> Model:

@@ -65,31 +65,6 @@ def first_order_lag(value: Any, target: Any, dt: Any, lag: Any, rate: Any):
     return value + wp.clamp(change, -rate * dt, rate * dt)
 
 
-def follow_commands(
-    wanted: wp.array3d(dtype=wp.float64),
-    lags: wp.array2d(dtype=wp.float64),
-    start: wp.float64,
-    steps: wp.array2d(dtype=wp.float64),
-    reached: wp.array3d(dtype=wp.float64),
-):
-    """Follow wanted speeds and steering angles (P, T, 2) over steps (P, T), s.
-
-    The columns of lags (P, 6) are lag of speed and steering, s, rates up, down and of steering, and the highest speed.
-    """
-    p = wp.tid()
-    speed = start
-    steering = wp.float64(0.0)
-    for k in range(wanted.shape[1]):
-        dt = steps[p, k]
-        rate = lags[p, 2]
-        if wp.abs(wanted[p, k, 0]) < wp.abs(speed):
-            rate = lags[p, 3]
-        speed = wp.clamp(first_order_lag(speed, wanted[p, k, 0], dt, lags[p, 0], rate), -lags[p, 5], lags[p, 5])
-        steering = first_order_lag(steering, wanted[p, k, 1], dt, lags[p, 1], lags[p, 4])
-        reached[p, k, 0] = speed
-        reached[p, k, 1] = steering
-
-
 @wp.func
 def actuate(d: Any, speed: Any, turn: Any, lateral: Any, command: Any, dt: Any):
     """Return (speed, turn, lateral speed) after dt under a command and the limits `d`."""

@@ -10,9 +10,9 @@ from typing import Any, Literal, Self
 from pydantic import Field, model_validator
 
 from coopenv.base.errors import CoopenvError, DataError, check_one_of, listed, suggest
-from coopenv.base.sections import Section, read_toml, validated, with_tables
+from coopenv.base.sections import Section, read_toml, validated
 from coopenv.cars.messages.readings import READERS
-from coopenv.cars.settings.deployment import Car, Marker, refuse_repeated
+from coopenv.cars.settings.deployment import Car, Marker, refuse_repeated, with_tables
 from coopenv.cars.settings.limits import Number, Positive
 from coopenv.cars.settings.profile import (
     AUTHORS,

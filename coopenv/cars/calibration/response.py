@@ -18,7 +18,7 @@ from coopenv.base.errors import DataError
 from coopenv.cars.calibration.batch import LEAST_PLACE, LOSS, ParameterKind, by_stretch, deviation, standard_errors
 from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import Mask
-from coopenv.motions.command import follow_commands
+from coopenv.motions.command import first_order_lag
 from coopenv.world.launch import kernel, launch, start_warp
 
 GRID = 0.01  # s, longest step of the model
@@ -51,6 +51,31 @@ SIGNED = ("fake.steering_offset", "fake.gyro_bias", "fake.wheel_scale")
 DEAD_BAND = "dynamics.dead_band"
 PRIOR, STEPS = (np.array([getattr(kind, name) for kind in KINDS]) for name in ("prior", "step"))
 LEAST = np.array([-np.inf if kind.name in SIGNED else 1e-3 for kind in KINDS])
+
+
+def follow_commands(
+    wanted: wp.array3d(dtype=wp.float64),
+    lags: wp.array2d(dtype=wp.float64),
+    start: wp.float64,
+    steps: wp.array2d(dtype=wp.float64),
+    reached: wp.array3d(dtype=wp.float64),
+):
+    """Follow wanted speeds and steering angles (P, T, 2) over steps (P, T), s.
+
+    The columns of lags (P, 6) are lag of speed and steering, s, rates up, down and of steering, and the highest speed.
+    """
+    p = wp.tid()
+    speed = start
+    steering = wp.float64(0.0)
+    for k in range(wanted.shape[1]):
+        dt = steps[p, k]
+        rate = lags[p, 2]
+        if wp.abs(wanted[p, k, 0]) < wp.abs(speed):
+            rate = lags[p, 3]
+        speed = wp.clamp(first_order_lag(speed, wanted[p, k, 0], dt, lags[p, 0], rate), -lags[p, 5], lags[p, 5])
+        steering = first_order_lag(steering, wanted[p, k, 1], dt, lags[p, 1], lags[p, 4])
+        reached[p, k, 0] = speed
+        reached[p, k, 1] = steering
 
 
 class Response:

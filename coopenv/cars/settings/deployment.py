@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
-from coopenv.base.sections import Section, read_toml, validated, with_tables
+from coopenv.base.sections import Section, read_toml, validated
 from coopenv.cars.fake.settings import USUAL as DEFAULT_FAKE
 from coopenv.cars.fake.settings import FakeSettings
 from coopenv.cars.gate.gate import TIMEOUT
@@ -143,6 +143,23 @@ class Car(Section):
     def agent_number(self) -> int | None:
         """Its number in the authors' names; None: it has none."""
         return self.marker if self.agent is None else self.agent
+
+
+def with_tables(
+    raw: Mapping[str, Any], more: Mapping[str, Any], keys: Sequence[str], where: str, error: type[CoopenvError]
+) -> dict[str, Any]:
+    """Return plain data with the entries of tables of another file added, `where` both are named.
+
+    Raises:
+        CoopenvError: of class `error`; one of them is no table.
+    """
+    joined = dict(raw)
+    for key in keys:
+        own, other = raw.get(key, {}), more.get(key, {})
+        if not (isinstance(own, Mapping) and isinstance(other, Mapping)):
+            raise error(f"{where}: {key}: expected a table")
+        joined[key] = {**own, **other}
+    return joined
 
 
 def refuse_repeated(cars: Sequence[Car], markers: Mapping[str, int], numbers: tuple[int, int] | None = None) -> None:
