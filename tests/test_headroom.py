@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 import coopenv
+from benchmarks.contact import measure
 from coopenv.api.engine import Engine
 from coopenv.bench.contest import Contest
 from coopenv.bench.evaluation import evaluated
 from coopenv.evaluation import Difference, Episodes, compare_paired, drive, held_out_seeds, ranking_key, score
-from coopenv.evaluation.metrics import scored_errors
+from coopenv.evaluation.metrics import LOST, scored_errors
 from coopenv.policies import load_agent
 from coopenv.scenario import load_scenario
 from coopenv.scenario.difficulty import Difficulty
@@ -27,6 +28,8 @@ pytestmark = pytest.mark.headroom
 
 WORLDS = {"open_square": 16, "facade": 16, "behind_truck": 16, "urban_crossing": 48, "large_crossing": 6}
 """Number of worlds for intervals that separate the drivers."""
+OF_CONTACT = {"underpass": 16, "warehouse": 16}
+"""The same, where measurements between vehicles localise those that nothing else does."""
 MOST_TIME = 0.05
 """Share of the travel time that looking may cost."""
 
@@ -35,7 +38,7 @@ MOST_TIME = 0.05
 def episodes(environment: str, agent: str, sensing: str = "sensed", times: int = 2) -> Episodes:
     """Return a driver's episodes in so many times half of the environment's worlds."""
     scenario = load_scenario(environment, {"sensing": sensing})
-    worlds = times * WORLDS[environment] // 2
+    worlds = times * (WORLDS | OF_CONTACT)[environment] // 2
     return drive(Engine(scenario, worlds), load_agent(agent, scenario), held_out_seeds(9, worlds))
 
 
@@ -44,6 +47,21 @@ def figures(
     environment: str, agent: str, sensing: str = "sensed", times: int = 2
 ) -> dict[str, tuple[float, float, float]]:
     return {r.metric: (r.mean, r.ci_low, r.ci_high) for r in score(episodes(environment, agent, sensing, times))}
+
+
+@pytest.mark.parametrize("environment", OF_CONTACT)
+def test_contact_pays(environment: str) -> None:
+    """Intervals of the scores do not overlap, errors keep below the largest that counts, and every vehicle arrives."""
+    contact, none = (figures(environment, agent) for agent in ("keep_contact", "route_follower"))
+    assert contact["e95_m"][2] < none["e95_m"][1] and none["e95_m"][2] < 0.95 * LOST
+    assert contact["arrival_rate"][0] == 1.0 and contact["collision_rate"][0] == 0.0
+
+
+def test_measurements_of_vehicles_localise_those_without_satellites() -> None:
+    found = measure("underpass", "keep_contact", ["robust"], [21, 22], 40.0)
+    for name, share in (("robust", 0.8), ("bound", 0.6)):
+        without, contact = np.mean(found[name], axis=0)
+        assert contact < share * without
 
 
 def standing(found: Mapping[str, tuple[float, float, float]]) -> tuple[float, float, float]:

@@ -132,7 +132,7 @@ class Kind(ABC):
     units: tuple[str, ...]  # (rows,) of the residual
     towards: tuple[str, ...] = ("landmarks", "vehicles")  # what it measures where a scenario does not say
     needs: tuple[str, ...] = ()  # "rotation" and "velocity": what it has to know of a target beside the position
-    drawn: Literal["line", "none"] = "line"  # how pictures show a measurement: a line to its target, or not
+    drawn: Literal["line", "cross", "none"] = "line"  # in pictures: a line to its target, a cross on the sensor, or not
     under_sky = False  # True: what hides the sky above it occludes it, as for a receiver of satellites
     in_warp: WarpFunctions | None = None  # None: it is computed in NumPy alone
 

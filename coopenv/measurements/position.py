@@ -31,6 +31,7 @@ class Position(Kind):
     has_target = False
     noise, units = (1.0, 1.0, 2.0), ("m", "m", "m")
     towards = ("map",)
+    drawn = "cross"
     under_sky = True
     in_warp = WarpFunctions(predict_position, plus_noise, excess, derive_position)
 

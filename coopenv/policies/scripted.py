@@ -107,9 +107,11 @@ class KeepContact(RouteFollower):
     def __init__(self, scenario: Scenario) -> None:
         """See `Driver`."""
         super().__init__(scenario)
-        ranges = [sensor.range for sensor in scenario.sensors] + [camera.range for camera in scenario.cameras]
+        others = range(len(scenario.landmarks), len(scenario.target_names))
+        sensors = [s for s in scenario.sensors if any(s.measures(scenario, other) for other in others)]
+        ranges = [sensor.range for sensor in sensors] + [camera.range for camera in scenario.cameras]
         self.reach = min((reach for reach in ranges if reach is not None), default=np.inf)
-        """Shortest range of any sensor, m."""
+        """Shortest range of any sensor of vehicles, m."""
 
     def speed(self, observations: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
         """See `RouteFollower.speed`."""

@@ -287,20 +287,25 @@ class Stage:
         """Return the points that cameras see, (A, 3)."""
         return np.asarray(frame.target_position + (frame.target_rotation @ self.marker[..., None])[..., 0])
 
-    def reading_lines(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-        """Return the vehicles (m,) of measurements by sensors beside the camera, and lines (m, 2, 3) to their targets.
+    def reading_lines(self, frame: Frame, least: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Return the vehicles (m,) of measurements by sensors beside the camera, and lines (m, 2, 3) that show them.
 
-        A measurement is shown until the next one of the sensor is due.
+        A line to the target, or a cross on a sensor that measures its place, is shown until the next one is due.
+        A cross is as wide as the longest body, or `least` m.
         """
         vehicles, lines = [np.empty(0, int)], [np.empty((0, 2, 3))]
+        cross = max(least, self.bodies()[0].max()) / 2 * np.insert(CORNERS, 2, 0, axis=1)
         ticks, rate, targets = frame.reading_tick, self.scenario.rates.camera, self.targets(frame)
         for d, section in enumerate(self.scenario.sensors if ticks is not None else ()):
-            if ticks is not None and section.made.drawn == "line" and section.made.has_target:
+            kind, locates = section.made, section.white.max() < self.side
+            arms = cross if kind.drawn == "cross" and locates else ()
+            if ticks is not None and (len(arms) or (kind.drawn == "line" and kind.has_target)):
                 since, period = frame.tick - ticks[:, d], max(1.0, rate / (section.rate or rate))
                 i, target = np.nonzero((ticks[:, d] >= 0) & (since < period))
                 start = frame.position[i] + frame.rotation[i] @ np.array(section.position)
-                vehicles.append(i)
-                lines.append(np.stack([start, targets[target]], axis=1))
+                ends = [(start + arm, start) for arm in arms] or [(start, targets[target])]
+                vehicles += [i] * len(ends)
+                lines += [np.stack(pair, axis=1) for pair in ends]
         return np.concatenate(vehicles), np.concatenate(lines)
 
     def fields_of_view(self, frame: Frame, every: int = 1, of: slice = _ALL) -> np.ndarray | None:

@@ -83,7 +83,7 @@ def _opened(title: str, picture: np.ndarray) -> Any:
 
 
 _SHORTEST = 28  # px, drawn length of a vehicle
-_POINTER = 13  # px
+_POINTER, _CROSS = 13, 30  # px; a cross on a sensor that measures its place is wider than a vehicle
 _LABEL = 3  # px between a vehicle and its name
 _FARTHEST = 10.0  # pictures' sides from the middle, of an estimate as drawn
 _POINT = Body(size=(2e-3, 1e-3, 1e-3))  # stands in for a vehicle without a body, drawn at the least size
@@ -254,7 +254,7 @@ class TopView:
             lines.set_segments(list(np.stack([eye[observer], target[seen]], axis=1)))
             if "color" not in ground.SIGHT_LOOKS[kind]:
                 lines.set_color(to_rgba_array(self._rgba[observer], 0.9))
-        observer, lines = self._stage.reading_lines(frame)
+        observer, lines = self._stage.reading_lines(frame, _CROSS * self._pixel)
         self._readings.set_segments(list(lines[..., :2]))
         self._readings.set_color(to_rgba_array(self._rgba[observer], 0.9))
         wedges = self._stage.fields_of_view(frame)

@@ -34,7 +34,7 @@ _LANES = 14  # dashes of a road's marks over a side of the scene
 _BEHIND, _ABOVE = 5.5, 2.6  # lengths of the vehicle, of the camera that follows it
 _STEEP, _SHARE = 50.0, 0.62  # of the camera above a pair: elevation, deg, and share of the height between the two
 _SLOW = 0.75  # of the top speed, below which a vehicle of a pair waits
-LEGEND = "solid: true pose, faded: estimate, thin line: measured by a camera, ball: landmark"
+LEGEND = "solid: true pose, faded: estimate, thin line: measurement, ball: landmark"
 """Stands in pictures, but for those through a vehicle's camera."""
 _LEFTMOST = 60.0  # deg, vertical field of view of a driver's camera that sees in every direction
 
@@ -303,15 +303,15 @@ class View3d:
         return [box for box in self._stage.solid(frame) if box.agent < self._stage.landmarks]
 
     def _draw_sight(self, frame: Frame) -> None:
-        observer, seen = np.nonzero(frame.sight == Sight.VISIBLE)
-        drawn = self._shown[observer]
-        observer, seen = observer[drawn], seen[drawn]
+        observer, seen = np.nonzero((frame.sight == Sight.VISIBLE) & self._shown[:, None])
         ends = np.stack([self._stage.eyes(frame)[observer], self._stage.targets(frame)[seen]], axis=1)
         cars = seen >= self._stage.landmarks  # a vehicle that is measured, on which an estimate depends
         self._draw_lines("sight", ends[~cars], observer[~cars], 1.0, opacity=0.45)
         self._draw_lines(
             "sight of vehicles", ends[cars], observer[cars], 4.0 if self._camera == "pair" else 1.5, opacity=0.8
         )
+        vehicle, lines = self._stage.reading_lines(frame)
+        self._draw_lines("readings", lines[self._shown[vehicle]], vehicle[self._shown[vehicle]], 1.5, opacity=0.8)
 
     def _draw_lines(self, name: str, segments: np.ndarray, vehicle: np.ndarray, width: float, **more: Any) -> None:
         """Draw line segments (K, 2, 3) of vehicles (K,) in their colours; segments with NaN are left out."""

@@ -83,6 +83,12 @@ def test_contact_is_kept_by_waiting_for_the_next_car_behind(x: float, speed: flo
     assert driver.drive(observation(**other(x, 0.3, 0.0)))[0][0] == pytest.approx(speed * driver.cruise, rel=0.02)
 
 
+def test_contact_has_the_reach_of_sensors_of_vehicles() -> None:
+    tags = {"kind": "relative_pose", "towards": ["landmarks"], "range": 1.0}
+    ranges = {"kind": "range", "towards": ["vehicles"], "range": 4.0}
+    assert [KeepContact(square(sensors=sensors)).reach for sensors in ([tags], [tags, ranges])] == [6.0, 4.0]
+
+
 @pytest.mark.parametrize(
     ("x", "y", "angle", "speed"),
     [

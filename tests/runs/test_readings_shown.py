@@ -16,6 +16,7 @@ from coopenv.runs.summary import facts
 from coopenv.scenario import Scenario
 from coopenv.viz.stage import Stage
 from coopenv.viz.topview import TopView
+from coopenv.viz.view3d import View3d
 from tests.helpers.builders import circling, scenario
 
 OTHERS = [["L1", "L2", "vehicle_2"], ["L1", "vehicle_1", "vehicle_3"], ["L3", "vehicle_1"]]
@@ -41,12 +42,45 @@ def test_lines_go_from_the_sensor_to_measured_targets_until_the_next_measurement
     vehicles, lines = stage.reading_lines(frame)
     measured = np.isfinite(made.measured.readings["range"][3]).all(axis=-1)
     expected, targets = np.nonzero(measured)
+    vehicles, lines = vehicles[: len(expected)], lines[: len(expected)]  # crosses of the second sensor follow
     assert_array_equal(vehicles, expected)
     assert_allclose(lines[:, 0], [frame.position[i] + frame.rotation[i] @ PLACE for i in expected])
     assert_allclose(lines[:, 1], stage.targets(frame)[targets])
     view = TopView(described())
     drawn = view.paint(frame)
     assert (drawn != view.paint(replace(frame, reading_tick=None))).any()
+
+
+def test_a_measured_position_is_a_cross_on_its_sensor() -> None:
+    """Four arms of one size, in plan, from the antenna to the corners of a square, while there is a measurement."""
+    frame = episode().frame(4)
+    ticks = frame.reading_tick
+    assert ticks is not None
+    ticks[:, 0], ticks[1, 1] = -1, 1  # no ranges; the second vehicle has lost its satellites
+    vehicles, lines = Stage(described()).reading_lines(replace(frame, reading_tick=ticks))
+    assert_array_equal(vehicles, [0, 2] * 4)
+    assert_allclose(lines[:, 1], frame.position[vehicles])
+    arms = (lines[:, 0] - lines[:, 1]).reshape(4, 2, 3)
+    assert_allclose(np.abs(arms), np.broadcast_to(np.abs(arms[0, 0]), arms.shape))
+    assert_allclose(arms.sum(axis=0), 0.0, atol=1e-12)
+    assert_allclose(np.abs(arms[0, 0, :2]), arms.max())
+    assert (arms[..., 2] == 0.0).all() and arms.max() > 0.1
+
+
+def test_a_position_that_is_less_accurate_than_the_scene_is_large_has_no_cross() -> None:
+    """As the height of a road, which says nothing of the place in plan."""
+    height = {"kind": "position", "noise": [1e3, 1e3, 0.1]}
+    blurred = scenario(circling(OTHERS), horizon=0.5, sensors=[height], topology={"acyclic": False})
+    frame = record_episode(blurred, seed=3).frame(4)
+    assert frame.reading_tick is not None and (frame.reading_tick[:, 0, 0] == 4).all()
+    assert len(Stage(blurred).reading_lines(frame)[0]) == 0
+
+
+def test_films_in_3d_show_measurements() -> None:
+    pytest.importorskip("pyvista", reason="needs the extra film3d")
+    view, frame = View3d(described(), (320, 240)), episode().frame(4)
+    with_lines = view.paint(frame).copy()
+    assert (with_lines != view.paint(replace(frame, reading_tick=None))).any()
 
 
 def test_scenes_keep_which_targets_were_measured(tmp_path: Path) -> None:
