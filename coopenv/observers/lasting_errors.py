@@ -1,16 +1,18 @@
-"""Lasting errors of odometry and camera as states of a filter, and how they change an increment and bearings.
+"""Lasting errors of odometry, camera and other sensors as states of a filter, and what they change.
 
 Source of the errors of a differential drive: Borenstein and Feng, Measurement and correction of systematic odometry
 errors in mobile robots, IEEE Transactions on Robotics and Automation 12(6), 1996 (unequal wheels: `curvature`, unknown
 wheelbase: `turn_scale`).
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from coopenv.estimation.compiled import cross_matrix, exp_so3, right_jacobian
 from coopenv.estimation.poses import Array, log_so3
+from coopenv.measurements.sensor import Sensor
 from coopenv.observers.contract import SensorNoise, Tick
 from coopenv.observers.frame import BEARING_ROWS, CAMERA, LinearMeasurements, UsableMeasurements
 
@@ -29,9 +31,9 @@ class CalibratedStep(NamedTuple):
 
 
 class LastingErrors:
-    """The lasting errors of one vehicle that its noise declares, c of them: those with a standard deviation."""
+    """The lasting errors of one vehicle that its noise and sensors declare: the c with a standard deviation."""
 
-    def __init__(self, noise: SensorNoise) -> None:
+    def __init__(self, noise: SensorNoise, sensors: Sequence[Sensor] = ()) -> None:
         std, walk = np.zeros(STATES), np.zeros(STATES)
         std[SCALE], walk[SCALE] = noise.odometry_scale, noise.odometry_scale_walk
         std[GYRO], walk[GYRO] = noise.gyro_bias, noise.gyro_bias_walk
@@ -42,6 +44,11 @@ class LastingErrors:
             noise.odometry_lead,
         )
         std[ORIENTATION] = noise.camera_orientation
+        self.of_sensors = {n: sensor.kind.rows for n, sensor in enumerate(sensors) if any(sensor.bias) or sensor.scale}
+        declared = [[*(sensors[n].bias or np.zeros(rows)), sensors[n].scale] for n, rows in self.of_sensors.items()]
+        std = np.concatenate([std, *declared])
+        self.count = len(std)
+        walk = np.pad(walk, (0, self.count - STATES))
         self.states = np.flatnonzero(std + walk)
         self.variances = np.square(std[self.states])
         self.walk = np.square(walk[self.states])  # per s
@@ -54,7 +61,7 @@ class LastingErrors:
         """Return the increment of a tick, given values (c,) of the lasting errors."""
         turn, move = log_so3(tick.rotation), np.asarray(tick.translation, float)
         now = np.array([tick.angular_velocity, tick.velocity])
-        J = np.zeros((6, STATES))
+        J = np.zeros((6, self.count))
         J[3:, SCALE] = -move
         J[:3, TURN_SCALE] = -turn
         J[:3, GYRO] = -tick.dt * np.eye(3)
@@ -68,18 +75,26 @@ class LastingErrors:
         by_errors = np.concatenate([right_jacobian(turn) @ J[:3], rotation.T @ J[3:]])
         return CalibratedStep(rotation, move, by_errors)
 
-    def on_bearings(
+    def on_measurements(
         self, linear: LinearMeasurements, tick: Tick, measured: UsableMeasurements, values: Array
     ) -> LinearMeasurements:
         """Return linearised measurements (m, r, 6) with derivatives (m, r, 6 + c), less what values (c,) explain.
 
         An error of the camera's orientation moves a bearing as a turn of the vehicle about the camera.
         """
-        by_orientation = np.zeros((*linear.residual.shape, STATES))
-        of_camera = slice(None) if measured.others is None else measured.others.sensor == CAMERA
+        by_errors = np.zeros((*linear.residual.shape, self.count))
+        number = None if measured.others is None else measured.others.sensor
+        of_camera = slice(None) if number is None else number == CAMERA
         H = linear.H[of_camera, :BEARING_ROWS]
         about_camera = H[..., :3] + H[..., 3:] @ cross_matrix(np.asarray(tick.lever_arm, float))
-        by_orientation[of_camera, :BEARING_ROWS, ORIENTATION] = about_camera
-        columns = by_orientation[..., self.states]
+        by_errors[of_camera, :BEARING_ROWS, ORIENTATION] = about_camera
+        first = STATES
+        for sensor, rows in self.of_sensors.items():
+            if measured.others is not None and (own := np.flatnonzero(number == sensor)).size:
+                used = linear.used[own, :rows]  # type: ignore[index]
+                by_errors[own, :rows, first : first + rows] = used[..., None] * np.eye(rows)
+                by_errors[own, 0, first + rows] = used[:, 0] * measured.others.values[own, 0]
+            first += rows + 1
+        columns = by_errors[..., self.states]
         H = np.concatenate([linear.H, columns], axis=-1)
         return linear._replace(residual=linear.residual - columns @ values, H=H)

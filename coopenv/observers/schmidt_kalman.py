@@ -312,9 +312,14 @@ class SchmidtKalman(ConsiderFilter):
         between = np.zeros((len(seen), len(seen), 6, 6))
         for n, (target, message) in enumerate(seen):
             for m, (other, its) in enumerate(seen[:n]):
-                between[n, m] = sent_cross_covariance(message, other) + sent_cross_covariance(its, target).T
+                between[n, m] = self.between(sent_cross_covariance(message, other), sent_cross_covariance(its, target))
         self.nis_dof = self.dof(tick, measured)
         self.nis = self.fuse(tick, measured, between)
+
+    @staticmethod
+    def between(by_one: Array, by_other: Array) -> Array:
+        """Return the cross-covariance (6, 6) of two neighbours from what the two have sent; one of them knows it."""
+        return by_one + by_other.T
 
 
 def sent_cross_covariance(message: Message, target: int) -> Array:
