@@ -14,7 +14,7 @@ TABLE = "docs/observers.md"
 MORE = {
     "riccati": "../../method.md",
     "robust": "../../robust.md",
-    "planar_robust": "../../planar_robust.md",
+    "self_calibrating": "../../data.md",
 }
 """Where the documents explain an observer."""
 HEAD = """# Observers

@@ -85,17 +85,6 @@ def drifting(rate: float) -> Change:
     return change
 
 
-def blindfolded(data: Dataset, *subjects: int) -> Dataset:
-    """Return a sub-dataset in which some robots see no landmark."""
-    robots = (
-        replace(one, detections=one.detections[one.detections[:, 1] < LANDMARKS_FROM])
-        if one.subject in subjects
-        else one
-        for one in data.robots
-    )
-    return replace(data, robots=tuple(robots))
-
-
 def _part(robot: Robot, start: float, end: float) -> Robot:
     told, seen, truth = robot.odometry, robot.detections, robot.truth
     before = max(int(np.searchsorted(told[:, 0], start, side="right")) - 1, 0)  # the command held at the start

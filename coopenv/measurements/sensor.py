@@ -100,6 +100,8 @@ class Sensor:
     rotation: Array  # (3, 3) sensor to body
     options: str = "{}"  # arguments of a user's class, JSON
     std_by_distance: float = 0.0  # of the noise beside `std`, per m to the target
+    bias: tuple[float, ...] = ()  # (rows,) standard deviations of constant errors, in the units of the rows, or empty
+    scale: float = 0.0  # standard deviation of a constant relative error of its first row
 
     @cached_property
     def kind(self) -> Kind:

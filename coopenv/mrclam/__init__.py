@@ -1,1 +1,1 @@
-"""The data set MR.CLAM, recorded robots on a plane, and observers for such robots."""
+"""The data set MR.CLAM: recorded robots on a level floor."""

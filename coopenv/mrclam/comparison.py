@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import ClassVar
 
 from coopenv.bench.observers.sources import RecordSource, already_warned
-from coopenv.mrclam.dataset import IN_SPACE
 from coopenv.mrclam.source import MRCLAM
 from coopenv.observers.recording import Recording
 from coopenv.sources.selection import WHOLE, Selection
@@ -26,8 +25,8 @@ class Robots(RecordSource):
 
     @property
     def planar(self) -> bool:
-        """True if observers get commands on a plane, False for odometry in space."""
-        return not self.name.endswith(IN_SPACE)
+        """False: commands are calibrated to odometry, so that observers for vehicles in space suit the robots."""
+        return False
 
     def world(self) -> Recording:
         """Return the robots' record."""

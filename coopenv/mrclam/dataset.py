@@ -17,7 +17,7 @@ from coopenv.estimation.poses import MISFIT_DEG, Array, about_z, bearing_misfit_
 
 NAMES = tuple(f"mrclam_{number}" for number in range(1, 10))
 IN_SPACE = "_space"
-"""Behind a name: the robots as vehicles in space, with ranges and calibrated odometry."""
+"""May stand behind a name, which it does not change."""
 ENVIRONMENT_VARIABLE = "COOPENV_DATA"
 
 MAX_PAUSE_S = 3600.0  # between two rows; more is a broken time stamp
@@ -349,11 +349,6 @@ class HeldCommands:
         long = np.flatnonzero(np.diff(t, append=np.inf) > MAX_HOLD_S)
         self._t = np.insert(t, long + 1, t[long] + MAX_HOLD_S)
         self._v, self._omega = np.insert(v, long + 1, 0.0), np.insert(omega, long + 1, 0.0)
-
-    def commands(self, t: Array) -> tuple[Array, Array]:
-        """Return the velocity (K,) m/s and angular velocity (K,) rad/s that hold at times t (K,) in s."""
-        k = np.searchsorted(self._t, t, side="right") - 1
-        return np.where(k < 0, 0.0, self._v[k]), np.where(k < 0, 0.0, self._omega[k])
 
     def sums(self, t: Array) -> Array:
         """Return (K, 2) by how many rad and m the robot was to turn and to drive until times t (K,) in s."""

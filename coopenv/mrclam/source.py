@@ -1,4 +1,4 @@
-"""MR.CLAM as a kind of source: `mrclam_1` .. `mrclam_9`, with `_space` for observers in space."""
+"""MR.CLAM as a kind of source: `mrclam_1` .. `mrclam_9`."""
 
 from __future__ import annotations
 
@@ -25,12 +25,7 @@ def read(name: str | Path, data: str | Path | None, variant: str | None) -> Reco
     from coopenv.mrclam.recording import check_variant, load_dataset, recording_of
 
     chosen = check_variant(variant or "landmarks+robots")  # before much is read
-    dataset = load_dataset(str(name).removesuffix(IN_SPACE), data)
-    if str(name).endswith(IN_SPACE):
-        from coopenv.mrclam.in_space import spatial_recording_of
-
-        return spatial_recording_of(dataset, chosen)
-    return recording_of(dataset, chosen)
+    return recording_of(load_dataset(str(name).removesuffix(IN_SPACE), data), chosen)
 
 
 MRCLAM = SourceKind(
@@ -48,5 +43,5 @@ MRCLAM = SourceKind(
         "blind": "robots 3 to 5 see no landmark",
     },
     caveat="Friendly: robots start at their true pose; who is seen is known from barcodes, "
-    "their own left out; the wheels' response was fitted to these robots; all receive from all, 10 Hz, no loss.",
+    "their own left out; the nominal calibration was fitted to sub-dataset 6; all receive from all, 10 Hz, no loss.",
 )

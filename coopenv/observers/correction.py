@@ -41,7 +41,8 @@ from coopenv.estimation.compiled import (
     transformed,
 )
 from coopenv.estimation.poses import Array, solve
-from coopenv.observers.frame import CAMERA, FRAME, Frame, UsableMeasurements
+from coopenv.measurements.kinds import MOST_ROWS, unit
+from coopenv.observers.frame import FRAME, Frame, UsableMeasurements
 from coopenv.observers.linearisation import (
     FLAG_ROWS,
     FLAGS,
@@ -136,6 +137,34 @@ def iterated(P: Array, look: Look, bend: Callable[[Array], float]) -> tuple[Arra
     return at, joseph(P, K, H, N), nis, len(N)
 
 
+CURVATURE_TIME = 12.0
+"""Time, s, in which all frames have the same second-order error. Tuned by `benchmarks.kinds` with ranges alone: with 0,
+2, 12 and 30 s ANEES of `schmidt_kalman` is 2.0, 1.4, 1.0 and 0.8, and RMSE over the bound 1.3, 1.1, 1.1 and 1.1."""
+
+
+def curvature(G: Array, angle: NDArray[np.bool_], line: Array, V: Array, frames: Array) -> Array:
+    """Return the variances (m, r) of second-order errors that are the same in several frames.
+
+    With errors s along the line of sight and t across it, a distance d has the error t^2 / 2d, and a direction has
+    t s / d^2. A direction in which measurements hardly determine the place keeps its error for seconds. As white noise,
+    the second-order error would average out, and the filter would be overconfident.
+
+    Args:
+        G: (m, r, 3) derivatives of the rows by the targets, map axes.
+        angle: (m, r) rows that measure directions; the others measure distances.
+        line: (m, 3) from the vehicle to the targets, map, m.
+        V: (m, 3, 3) covariances of these lines, m^2.
+        frames: (m,) which have the same error.
+    """
+    u, distance = unit(line)
+    along = np.einsum("mi,mij,mj->m", u, V, u)[:, None]
+    across = np.maximum(np.trace(V, axis1=1, axis2=2)[:, None] - along, 0.0)
+    radial = np.einsum("mri,mi->mr", G, u) ** 2
+    of_direction = np.maximum(along, 0.0) * across * (np.sum(G**2, axis=-1) - radial)
+    variances = np.where(angle, of_direction, 0.5 * across**2 * radial)
+    return np.asarray(frames[:, None] * variances / distance**2)
+
+
 LARGEST = 13.8155  # 0.999 of a chi-square of 2: -2 log 0.001
 LARGEST_OF = np.array([LARGEST, 10.828, LARGEST, 16.266, 18.467, 20.515, 22.458])
 """The same of as many degrees of freedom; a measurement without any row fits."""
@@ -196,19 +225,23 @@ def judged(
 PLACES = types.Array(types.int64, 1, "A", readonly=True)
 
 
-CONSTANTS = types.Tuple((MATRIX, VECTOR))
+CONSTANTS = types.Tuple((MATRICES, VECTOR))
+BY_POSE, BY_ROW, BY_VALUE = slice(0, 6), slice(6, 6 + MOST_ROWS), 6 + MOST_ROWS
 Constants = tuple[Array, Array]
-"""Constants of the camera behind the own pose in a state: the left error of the pose (6, c) that moves bearings as each
-of the constants does, and their values (c,)."""
-NO_CONSTANTS = np.zeros((6, 0)), np.zeros(0)
+"""Constants behind the own pose in a state: what they change, by sensor (s, 7 + MOST_ROWS, c), and their values (c,).
+
+They change measurements as a left error of the pose does (`BY_POSE`), rows (`BY_ROW`), and the first row by a multiple
+of the measured value (`BY_VALUE`)."""
+NO_CONSTANTS = np.zeros((1, BY_VALUE + 1, 0)), np.zeros(0)
 NO_PLACES, NO_CROSSES = np.zeros(0, np.int64), np.zeros((0, 6, 6))  # without neighbours
 
 
-@compiled(TARGET, MATRICES, MATRICES, FRAME, MATRIX, CONSTANTS, PLACES, WHOLE)
+@compiled(TARGET, MATRICES, MATRICES, FLAG_ROWS, FRAME, MATRIX, CONSTANTS, PLACES, WHOLE)
 def joint_jacobian(
     residual: Array,
     H: Array,
     by_target: Array,
+    used: NDArray[np.bool_],
     frame: Frame,
     recentring: Array,
     constants: Constants,
@@ -221,23 +254,27 @@ def joint_jacobian(
         residual: (m, r), from which what constants explain is subtracted.
         H: (m, r, 6) by the error about where it is linearised.
         by_target: (m, r, 6) as in `LinearMeasurements`.
+        used: (m, r) likewise.
         frame: the measurements.
         recentring: (6, 6) of the error of the own pose.
-        constants: of the camera.
+        constants: of the sensors.
         places: (m,) the neighbour of each measurement, -1: none; empty without neighbours.
         neighbours: k.
     """
-    (m, r, _), (by_pose, values) = H.shape, constants
+    (m, r, _), (by_sensor, values) = H.shape, constants
     own = 6 + len(values)
     whole = np.zeros((m, r, own + 6 * neighbours))
     for n in range(m):
         place(whole[n], 0, 0, product(H[n], recentring))
-        if own > 6 and frame[0].sensor[n] == CAMERA:
-            columns = product(H[n], by_pose)
-            place(whole[n], 0, 6, columns)
+        if own > 6:
+            of = by_sensor[frame[0].sensor[n]]
+            columns = product(H[n], of[BY_POSE]) + of[BY_ROW][:r]
+            columns[0] += frame[0].value[n, 0] * of[BY_VALUE]
             explained = transformed(columns, values)
             for k in range(r):
-                residual[n, k] -= explained[k]
+                if used[n, k]:
+                    whole[n, k, 6:own] = columns[k]
+                    residual[n, k] -= explained[k]
         if len(places) > 0 and places[n] >= 0:
             place(whole[n], 0, own + 6 * places[n], by_target[n])
     return whole
@@ -252,12 +289,12 @@ def looked(
     H is the derivative by the errors about the prediction; `recentring` (6, 6) is theirs. The poses of neighbours stay
     as they are. The other arguments are those of `halfway_gain`.
     """
-    by_pose, values = constants
+    by_sensor, values = constants
     own = 6 + len(values)
     residual, H, N, by_target, _, used, _, _ = linearise(R, p, kind == RIGHT, frame)
-    moved_constants = by_pose, values + at[6:own]
+    moved_constants = by_sensor, values + at[6:own]
     neighbours = (len(at) - own) // 6
-    whole = joint_jacobian(residual, H, by_target, frame, recentring, moved_constants, places, neighbours)
+    whole = joint_jacobian(residual, H, by_target, used, frame, recentring, moved_constants, places, neighbours)
     return stacked(residual, whole, N, by_target, used, frame)
 
 
@@ -275,7 +312,7 @@ def halfway_gain(
         p: (3,) the own position.
         P: (n, n) covariance of the own error, of constants, and of the errors of some neighbours.
         frame: the measurements.
-        constants: of the camera.
+        constants: of the sensors.
         places: see `joint_jacobian`.
     """
     at = np.zeros(len(P))
@@ -299,7 +336,7 @@ def judged_frame(
     errors of some neighbours. The other arguments are those of `halfway_gain`.
     """
     residual, H, N, by_target, _, used, angle, ahead = linearise(R, p, kind == RIGHT, frame)
-    whole = joint_jacobian(residual, H, by_target, frame, np.eye(6), constants, np.zeros(0, np.int64), 0)
+    whole = joint_jacobian(residual, H, by_target, used, frame, np.eye(6), constants, np.zeros(0, np.int64), 0)
     S = spread(whole, P, N)
     for n in range(len(places)):
         if places[n] >= 0:
@@ -311,6 +348,6 @@ def judged_frame(
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)
 def updated(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, float, int]:
     """Return R (3, 3), p (3,) in m, P (6, 6), r^T S^-1 r and the number of rows of the correction of a prediction."""
-    K, H, N, dx, nis = halfway_gain(kind, R, p, P, frame, (np.zeros((6, 0)), np.zeros(0)), np.zeros(0, np.int64))
+    K, H, N, dx, nis = halfway_gain(kind, R, p, P, frame, NO_CONSTANTS, np.zeros(0, np.int64))
     R, p, P = corrected(kind, R, p, dx, joseph(P, K, H, N))
     return R, p, P, nis, len(N)

@@ -30,7 +30,7 @@ import numpy as np
 from coopenv.estimation.compiled import MATRIX, NUMBER, VECTOR, WHOLE, compiled, congruent
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Tick
-from coopenv.observers.correction import halfway_gain, joseph
+from coopenv.observers.correction import NO_CONSTANTS, halfway_gain, joseph
 from coopenv.observers.frame import FRAME, Frame, UsableMeasurements
 from coopenv.observers.linearisation import linearise, linearised
 from coopenv.observers.pose_filters import Mekf
@@ -168,8 +168,7 @@ def updated_parts(
     kind: int, R: Array, p: Array, P: Array, P_i: Array, frame: Frame
 ) -> tuple[Array, Array, Array, Array, float, int]:
     """Return pose, P, P_i, r^T S^-1 r and the number of rows of a correction of a prediction of covariance P."""
-    no_constants = np.zeros((6, 0)), np.zeros(0)
-    K, H, N, dx, nis = halfway_gain(kind, R, p, P, frame, no_constants, np.zeros(0, np.int64))
+    K, H, N, dx, nis = halfway_gain(kind, R, p, P, frame, NO_CONSTANTS, np.zeros(0, np.int64))
     variance, used = linearise(R, p, kind == RIGHT, frame)[4:6]
     R_i = np.diag(variance.ravel()[used.ravel()])
     P_i = congruent(recentring(kind, dx), joseph(P_i, K, H, R_i))

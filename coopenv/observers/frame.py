@@ -51,6 +51,7 @@ ENTRY = np.dtype(
         ("rotation", np.float64, (3, 3)),  # likewise, NaN or zero where not known
         ("velocity", np.float64, 3),  # likewise, map axes, m/s
         ("covariance", np.float64, (6, 6)),  # of turn and shift of the target in its axes, or in the map's if not known
+        ("curvature", np.float64, MOST_ROWS),  # variances of second-order errors of the rows
     ],
     align=True,
 )
@@ -95,6 +96,13 @@ class UsableMeasurements(NamedTuple):
     def positions(self) -> Array:
         """(m, 3) of the targets as known or reported, map frame, m."""
         return np.asarray(self.entries["position"])
+
+    @property
+    def axes(self) -> Array:
+        """(m, 3, 3) axes of the covariances of the targets, to the map."""
+        R = self.entries["rotation"]
+        known = (R[:, :, 0] ** 2).sum(axis=1) > 0.0
+        return np.where(known[:, None, None], R, IDENTITY)
 
     def only(self, kept: NDArray[Any] | slice) -> "UsableMeasurements":
         """Return the measurements of a mask (m,), of numbers or of a range."""

@@ -260,7 +260,7 @@ def linearise(
         by_distance = sensors.variance_by_distance[s] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
         for k in range(sensors.rows[s]):
             add_place(right, R, J[n, k], a, z, H[n, k])
-            variance[n, k], used[n, k] = sensors.variance[s, k] + by_distance, True
+            variance[n, k], used[n, k] = sensors.variance[s, k] + by_distance + entries.curvature[n, k], True
             for i in range(3 if target >= 0 else 0):
                 by_target[n, k, i + 3] = axes[i, 0] * J[n, k, 0] + axes[i, 1] * J[n, k, 1] + axes[i, 2] * J[n, k, 2]
     if own != 0:
@@ -295,7 +295,8 @@ def put_own_kinds(
         target = Placed(its["position"], its["rotation"], its["velocity"], np.zeros_like(its["velocity"]))
         found = sensor.linearised(R, place_of_own.repeated(len(of)), target, its["value"][:, : sensor.kind.size])
         rows = slice(0, sensor.kind.rows)
-        residual[of, rows], variance[of, rows], used[of, rows] = found.residual, found.noise, found.used
+        residual[of, rows], used[of, rows] = found.residual, found.used
+        variance[of, rows] = found.noise + its["curvature"][:, rows]
         H[of, rows], by_target[of, rows] = found.by_own @ to_error, found.by_target
         known = np.isfinite(its["rotation"]).all(axis=(1, 2))
         by_target[of[known], rows, 3:] = found.by_target[known, :, 3:] @ its["rotation"][known]

@@ -16,11 +16,13 @@ from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled, exp_
 from coopenv.estimation.poses import Array, cholesky, lengths, solve
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.correction import (
+    CURVATURE_TIME,
     NO_CONSTANTS,
     NO_CROSSES,
     NO_PLACES,
     InnovationGate,
     Judgement,
+    curvature,
     iterated,
     judged,
     judged_frame,
@@ -81,6 +83,7 @@ class Mekf(PoseObserver):
         """Start at a pose."""
         super().reset(initial_pose, initial_covariance)
         self.gate = InnovationGate()
+        self.measured: dict[int, float] = {}  # s, time of the last measurement of each sensor beside the camera
 
     def update(self, tick: Tick) -> Estimate:
         """Predict, then correct by every usable bearing."""
@@ -99,12 +102,31 @@ class Mekf(PoseObserver):
 
     def take(self, tick: Tick, measured: UsableMeasurements) -> None:
         """Correct by the bearings that pass the gate."""
+        if len(measured.sensors) > 1:
+            self.add_curvature(tick, measured)
         if self.gated:
             kept = self.gate.passed(tick.time, self.judged(measured))
             if not kept.all():
                 measured = measured.only(kept)
         if len(measured.entries):
             self.correct(measured)
+
+    def add_curvature(self, tick: Tick, measured: UsableMeasurements) -> None:
+        """Set the variances of second-order errors of the measurements of other sensors than the camera."""
+        number, frames = measured.entries["sensor"], np.zeros(len(measured.entries))
+        for sensor in {*number.tolist()} - {CAMERA}:
+            passed = max(tick.time - self.measured.get(sensor, 0.0), tick.dt)
+            frames[number == sensor] = max(CURVATURE_TIME / passed, 1.0)
+            self.measured[sensor] = tick.time
+        linear, axes, line = linearised(self.state, measured), measured.axes, measured.positions - self.state.p
+        G = linear.by_target[..., 3:] @ axes.swapaxes(1, 2)
+        found = curvature(G, linear.angle, line, self.covariances_of_lines(measured, axes), frames)
+        measured.entries["curvature"][:, : found.shape[1]] = found
+
+    def covariances_of_lines(self, measured: UsableMeasurements, axes: Array) -> Array:
+        """Return (m, 3, 3) the covariances of the lines from the vehicle to its targets, map axes, m^2."""
+        of_targets = measured.weight * measured.entries["covariance"][:, 3:, 3:]
+        return self.state.point_covariance(np.zeros(3)) + axes @ of_targets @ axes.swapaxes(1, 2)
 
     def judged(self, measured: UsableMeasurements) -> Judgement:
         """Return how measurements are judged at the estimate."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ast
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -54,7 +55,7 @@ ZOO = {
     "split_covariance_intersection": ZooEntry("covariance_intersection:SplitCovarianceIntersection"),
     "pairwise": ZooEntry("schmidt_kalman:Pairwise"),
     "schmidt_kalman": ZooEntry("schmidt_kalman:SchmidtKalman"),
-    "self_calibrating": ZooEntry("self_calibrating:SelfCalibrating"),
+    "self_calibrating": ZooEntry("self_calibrating:SelfCalibrating", of_robots=True),
     "iterated_ekf": ZooEntry("pose_filters:IteratedEkf"),
     "left_invariant": ZooEntry("pose_filters:LeftInvariant"),
     "right_invariant": ZooEntry("pose_filters:RightInvariant"),
@@ -70,6 +71,9 @@ ZOO = {
     "fixed_lag_smoother": ZooEntry("smoother:FixedLagSmoother", on_a_plane=False),
 }
 """Observers of this package by name; `zoo` has those of coopenv's guests, too."""
+
+REPLACED = {"planar_ekf": "mekf_covariance", "planar_robust": "self_calibrating"}
+"""Former names of observers, to be removed in 0.10, and the observers that replace them."""
 
 
 GROUP = "coopenv.observers"
@@ -137,6 +141,15 @@ def _row(observer: Any) -> RegisteredObserver:
     return RegisteredObserver(None, observer) if _has_kernels(observer) else RegisteredObserver(observer, None)
 
 
+def current(name: str) -> str:
+    """Return the name of an observer; a former name emits a DeprecationWarning and gives that of the successor."""
+    if name not in REPLACED or name in _registered:
+        return name
+    successor = REPLACED[name]
+    warnings.warn(f"observer '{name}' is now '{successor}'", DeprecationWarning, stacklevel=3)
+    return successor
+
+
 def named(observer: str | Factory) -> str:
     """Return the name of an observer; a class or an import path is registered by the name of the class.
 
@@ -146,7 +159,7 @@ def named(observer: str | Factory) -> str:
     if isinstance(observer, list | tuple) or (isinstance(observer, str) and "," in observer):
         raise CoopenvError(f"observer {shown(observer)}: one at a time; several: coopenv.compare")
     if isinstance(observer, str) and not is_reference(observer):
-        return observer
+        return current(observer)
     place, found = (absolute_reference(observer), _loaded(observer)) if isinstance(observer, str) else ("", observer)
     row = _row(found)
     name = row.embedded.name if row.embedded is not None else place.rpartition(":")[2] or getattr(found, "__name__", "")
@@ -178,7 +191,7 @@ def portable(name: str) -> str | Factory:
 
 def list_observers() -> list[str]:
     """Return every known name, without classes and import paths that were merely used."""
-    return sorted({*zoo(), *_listed & _registered.keys(), *offered(GROUP)})
+    return sorted({*zoo(), *_listed & _registered.keys(), *offered(GROUP)} - REPLACED.keys())
 
 
 def states_covariance(name: str) -> bool:
@@ -223,7 +236,7 @@ def check_known(name: str) -> None:
         check_reference(name)
     elif name.endswith(".py"):
         raise CoopenvError(f"{name}: name a class or function in it: {name}:Class")
-    elif name not in {*_registered, *(names := list_observers())}:
+    elif name not in {*_registered, *REPLACED, *(names := list_observers())}:
         raise CoopenvError(f"unknown observer '{name}'{suggest(name, names)}; known: {', '.join(names)}")
 
 
@@ -254,6 +267,7 @@ def find(name: str | Factory) -> Factory:
     Raises:
         CoopenvError: unknown name, a missing dependency, an import that fails, or no factory.
     """
+    name = current(name) if isinstance(name, str) else name
     known = zoo().get(name) if isinstance(name, str) else None
     if known:
         if reason := obstacle(str(name)):
@@ -268,6 +282,7 @@ def find_embedded(name: str, planar: bool = False) -> Embedded | None:
 
     `planar` is for robots on a plane whose odometry is their commands.
     """
+    name = current(name)
     row = zoo().get(name)
     if row is None:
         return _found(name).embedded

@@ -28,7 +28,9 @@ from scipy.linalg import block_diag
 
 from coopenv.estimation.compiled import (
     MATRIX,
+    NUMBER,
     VECTOR,
+    WHOLE,
     adjoint,
     compiled,
     congruent,
@@ -77,7 +79,7 @@ class ConsiderFilter(Mekf):
 
     @property
     def constants(self) -> Constants:
-        """Constants of the camera that a subclass estimates."""
+        """Constants of the sensors that a subclass estimates."""
         return NO_CONSTANTS
 
     def __init__(self, setup: Setup) -> None:
@@ -129,6 +131,15 @@ class ConsiderFilter(Mekf):
         judgement: Judgement = judged_frame(*pose, self.covariance, frame, self.constants, crosses, places)
         return judgement
 
+    def covariances_of_lines(self, measured: UsableMeasurements, axes: Array) -> Array:
+        """Return those of `Mekf`, cross-covariances included."""
+        V, (seen, places) = super().covariances_of_lines(measured, axes), self.places(measured)
+        J = self.state.point_derivative(np.zeros(3))
+        for n in np.flatnonzero(places >= 0).tolist():
+            common = J.dot(self.neighbours[seen[places[n]]].cross[:6, 3:]).dot(axes[n].T)
+            V[n] -= common + common.T
+        return V
+
     def receive(self, target: int, message: Message) -> None:
         """Take the report of a neighbour, if it runs the same observer."""
         factor, number = (np.asarray(message.extra.get(name, np.nan)) for name in ("factor", "number"))
@@ -153,14 +164,17 @@ class ConsiderFilter(Mekf):
         seen, places = self.places(measured)
         of = [self.neighbours[t] for t in seen]
         joint = made_definite(self.joint_covariance(seen, between), len(self.covariance))
-        frame = measured.exact().frame
-        made = considered(self.state.R, self.state.p, joint, frame, self.constants, places)
-        R, p, P, change, carried, crosses, nis, dof = made
+        R, p, P, change, carried, crosses, nis, dof = self.considered(joint, measured.exact().frame, places)
         self.set_corrected(R, p, P, change)
         self.propagate_cross_covariances(carried, [t for t in self.neighbours if t not in seen])
         for target, was, cross in zip(seen, of, crosses, strict=True):
             self.neighbours[target] = ConsideredNeighbour(was.number, was.P, cross)
         return float(nis), dof
+
+    def considered(self, joint: Array, frame: Frame, places: NDArray[np.int64]) -> "Considered":
+        """Return the correction of the own error; arguments and result as for the function `considered`."""
+        made: Considered = considered(self.state.R, self.state.p, joint, frame, self.constants, places)
+        return made
 
     def set_corrected(self, R: Array, p: Array, P: Array, change: Array) -> None:
         """Set the corrected pose, the covariance (n, n) of the own error, and the change of the constants (n - 6,)."""
@@ -202,26 +216,15 @@ def made_definite(joint: Array, own: int) -> Array:
     return shrunk
 
 
-@compiled(MATRIX, VECTOR, MATRIX, FRAME, CONSTANTS, PLACES)
-def considered(
-    R: Array, p: Array, joint: Array, frame: Frame, constants: Constants, places: Any
-) -> tuple[Array, Array, Array, Array, Array, Array, float, int]:
-    """Correct the own error, linearised half way (correction.py); neighbours are considered (Schmidt).
+Considered = tuple[Array, Array, Array, Array, Array, Array, float, int]
 
-    Args:
-        R: (3, 3) the own orientation.
-        p: (3,) the own position.
-        joint: (n + 6k, n + 6k) covariance of the own error and those of k neighbours.
-        frame: the measurements; targets have no covariances.
-        constants: of the camera, n - 6 of them.
-        places: (m,) the neighbour of each measurement, -1: none.
 
-    Returns:
-        Orientation, position, covariance (n, n), change of the constants (n - 6,), the factor (n, n) of the other
-        cross-covariances, those with the neighbours (k, n, 6), r^T S^-1 r at the prediction, and the number of rows.
-    """
-    K, whole, N, dx, nis = halfway_gain(LEFT, R, p, joint, frame, constants, places)
-    own = 6 + len(constants[1])
+@compiled(MATRIX, VECTOR, WHOLE, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, NUMBER)
+def considered_from(
+    R: Array, p: Array, own: int, joint: Array, K: Array, whole: Array, N: Array, dx: Array, nis: float
+) -> Considered:
+    """Return the result of `considered` by that of `halfway_gain`, with an own error of `own` numbers."""
+    K = K.copy()
     K[own:] = 0.0
     after = joseph(joint, K, whole, N)
     R, p = moved(LEFT, R, p, dx[:6])
@@ -233,6 +236,26 @@ def considered(
     for n in range(len(crosses)):
         place(crosses[n], 0, 0, product(recentred, after[:own, own + 6 * n : own + 6 * n + 6]))
     return R, p, P, dx[6:own], carried, crosses, nis, len(N)
+
+
+@compiled(MATRIX, VECTOR, MATRIX, FRAME, CONSTANTS, PLACES)
+def considered(R: Array, p: Array, joint: Array, frame: Frame, constants: Constants, places: Any) -> Considered:
+    """Correct the own error, linearised half way (correction.py); neighbours are considered (Schmidt).
+
+    Args:
+        R: (3, 3) the own orientation.
+        p: (3,) the own position.
+        joint: (n + 6k, n + 6k) covariance of the own error and those of k neighbours.
+        frame: the measurements; targets have no covariances.
+        constants: of the sensors, n - 6 of them.
+        places: (m,) the neighbour of each measurement, -1: none.
+
+    Returns:
+        Orientation, position, covariance (n, n), change of the constants (n - 6,), the factor (n, n) of the other
+        cross-covariances, those with the neighbours (k, n, 6), r^T S^-1 r at the prediction, and the number of rows.
+    """
+    K, whole, N, dx, nis = halfway_gain(LEFT, R, p, joint, frame, constants, places)
+    return considered_from(R, p, 6 + len(constants[1]), joint, K, whole, N, dx, nis)
 
 
 @compiled(MATRIX, MATRIX, MATRIX)
@@ -276,8 +299,13 @@ class SchmidtKalman(ConsiderFilter):
         between = np.zeros((len(seen), len(seen), 6, 6))
         for n, (target, message) in enumerate(seen):
             for m, (other, its) in enumerate(seen[:n]):
-                between[n, m] = sent_cross_covariance(message, other) + sent_cross_covariance(its, target).T
+                between[n, m] = self.between(sent_cross_covariance(message, other), sent_cross_covariance(its, target))
         self.nis, self.nis_dof = self.fuse(measured, between)
+
+    @staticmethod
+    def between(by_one: Array, by_other: Array) -> Array:
+        """Return the cross-covariance (6, 6) of two neighbours from what the two have sent; one of them knows it."""
+        return by_one + by_other.T
 
 
 def sent_cross_covariance(message: Message, target: int) -> Array:

@@ -72,6 +72,7 @@ def sensors_of(scenario: Scenario, vehicle: int, neighbours: Sequence[int]) -> t
                 position=np.array(section.position),
                 rotation=section.mounting,
                 options=section.arguments,
+                bias=tuple(section.by_row("bias", section.bias).tolist()) if scenario.noise.enabled else (),
             )
         )
     return tuple(sensors)

@@ -119,12 +119,15 @@ class UncertainPose(NamedTuple):
         """Return the estimate moved by an error dx, of which P is the covariance about this one."""
         return type(self)(self.kind, *corrected(self.kind, self.R, self.p, dx, P))
 
+    def point_derivative(self, marker: Array) -> Array:
+        """Return the derivative (3, 6) of a point of the body in map axes by the error."""
+        if self.kind == RIGHT:
+            return np.concatenate([skew(-self.p - self.R.dot(marker)), IDENTITY], axis=1)
+        return np.concatenate([self.R.dot(skew(-marker)), self.R], axis=1)
+
     def point_covariance(self, marker: Array) -> Array:
         """Return the covariance (3, 3) in map axes of a point of the body."""
-        if self.kind == RIGHT:
-            J = np.concatenate([skew(-self.p - self.R.dot(marker)), IDENTITY], axis=1)
-        else:
-            J = np.concatenate([self.R.dot(skew(-marker)), self.R], axis=1)
+        J = self.point_derivative(marker)
         return np.asarray(J.dot(self.P).dot(J.T))
 
     def marker_covariance(self, marker: Array) -> Array:

@@ -220,9 +220,9 @@ def test_a_state_that_cannot_be_copied_is_reported() -> None:
         locked.get_state()
 
 
-def test_robots_on_a_plane_have_theirs_on_the_host(tmp_path: Path) -> None:
+def test_recorded_robots_have_observers_on_the_host(tmp_path: Path) -> None:
     mrclam_files.write(tmp_path, seconds=4.0)
-    env = coopenv.parallel_env("mrclam_6", data=tmp_path, observer="planar_robust", dtype="float64")
+    env = coopenv.parallel_env("mrclam_6", data=tmp_path, observer="self_calibrating", dtype="float64")
     assert env.engine.plugins is not None
     env.reset(seed=0)
     while env.agents:

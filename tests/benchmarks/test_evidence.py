@@ -13,12 +13,10 @@ from numpy.testing import assert_allclose
 
 from benchmarks import adversary, evidence, linear_case, linearisation, receipt
 from benchmarks.planar.__main__ import main
-from benchmarks.planar.changes import blindfolded, changed, clocks, drifting, hidden, misread, odometry, part
-from benchmarks.planar.lies import Drifting, Replaying
+from benchmarks.planar.changes import changed, clocks, drifting, hidden, misread, odometry, part
 from coopenv.bench.observers.faults import variant_of
 from coopenv.mrclam.recording import recording_of
 from coopenv.observers import run
-from coopenv.observers.contract import Message
 from coopenv.observers.recording import Recording
 from coopenv.observers.robust import constants
 from coopenv.runs import record
@@ -167,30 +165,12 @@ def test_sightings_are_hidden_misread_and_late(data):
     np.testing.assert_allclose(
         changed(data, 0, clocks(0.1)).robots[0].detections[:, 0], data.robots[0].detections[:, 0] + 0.1
     )
-    blind = blindfolded(data, 2)
-    assert (blind.robots[1].detections[:, 1] <= 5).all() and blind.robots[0] is data.robots[0]
 
 
-class Speaker:
-    def tampered(self, made, honest):
-        return made
-
-
-def test_messages_of_lying_senders():
-    honest = Message(position=np.zeros(3), covariance=np.eye(3))
-    liar = Drifting([1], jump=1.0, drift=0.5, since=10.0)
-    assert liar(0, 20.0, Speaker(), honest) is honest is liar(1, 9.0, Speaker(), honest)
-    assert np.linalg.norm(liar(1, 12.0, Speaker(), honest).position) == pytest.approx(2.0)
-    assert liar(1, 12.0, Speaker(), Message()).position is None
-    echo = Replaying([1], 3)
-    sent = [echo(1, 20.0, Speaker(), replace(honest, position=np.full(3, k))).position[0] for k in range(6)]
-    assert sent == [0, 0, 0, 0, 1, 2]
-
-
-def test_the_command_prints_a_row_per_lie_and_one_line_about_a_mistake(capsys, tmp_path):
-    assert main(["lies", "--seeds", "1", "--seconds", "6", "--only", "all see"]) == 0
+def test_the_command_prints_a_row_per_variant_and_one_line_about_a_mistake(capsys, tmp_path):
+    assert main(["barriers", "--seeds", "1", "--seconds", "4", "--observers", "mekf_covariance"]) == 0
     rows = capsys.readouterr().out.splitlines()
-    assert len(rows) == 4 and all(row.startswith("seed 1, all see landmarks, 1 lies, ") for row in rows)
+    assert len(rows) == 3 and all(row.startswith("seed 1, turns 0.7, ") for row in rows)
     assert main(["changed", "--data", str(tmp_path)]) == 2
     assert capsys.readouterr().err.count("\n") == 1
 

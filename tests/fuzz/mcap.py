@@ -26,7 +26,6 @@ from tests.helpers.recordings import simulated
 
 NUMBERS = (0.0, 1.0, -1.0, 1e-300, 0.5, 1e9, 1.1e9, 1e300, np.nan, np.inf, -np.inf)
 OBSERVERS = ("riccati", "robust", "mekf")
-ON_A_PLANE = ("riccati", "planar_robust", "mekf")
 
 
 @cache
@@ -60,13 +59,8 @@ def prepare() -> None:
             path = Path(folder) / "a.mcap"
             path.write_bytes(data)
             recording = read_recording(path)
-            for observer in those_for(recording):
+            for observer in OBSERVERS:
                 replay(recording, observer)
-
-
-def those_for(recording: Recording) -> tuple[str, ...]:
-    """Return the observers for vehicles in space, or for robots on a plane."""
-    return ON_A_PLANE if all(setup.planar for setup in recording.setups) else OBSERVERS
 
 
 def replay(recording: Recording, observer: str) -> None:
@@ -146,4 +140,4 @@ def case(number: int) -> str:
             good.write_bytes(data)
             header = {"header": lambda facts: other_header(rng, facts)} if kind < 0.6 else {}
             edit(good, path, **header, **({"messages": Editor(rng)} if kind > 0.5 else {}))
-        return taken(lambda: read_recording(path), lambda made: replay(made, str(rng.choice(those_for(made)))))
+        return taken(lambda: read_recording(path), lambda made: replay(made, str(rng.choice(OBSERVERS))))

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from coopenv.mrclam.dataset import MotionCapture, Robot
-from coopenv.mrclam.recording import Dataset, recording_of
-from coopenv.observers.recording import Recording
+from coopenv.mrclam.recording import Dataset
+from coopenv.mrclam.wheels import IROBOT_CREATE
 
 ORIGIN = 1248444187.0
 LANDMARKS = {6: (0.0, 4.0), 7: (4.0, 0.0), 8: (-4.0, 0.0), 9: (0.0, -4.0), 10: (3.0, 3.0)}
@@ -22,7 +21,7 @@ HEADER = (
 
 def pose(robot: int, t: np.ndarray) -> np.ndarray:
     """Return (N, 3) x, y, heading of a robot on its circle, exactly as v and omega say."""
-    v, omega = command(robot)
+    v, omega = motion(robot)
     heading = 0.6 * robot + omega * t
     radius = v / omega
     x = 0.8 * np.cos(robot) + radius * (np.sin(heading) - np.sin(0.6 * robot))
@@ -30,20 +29,28 @@ def pose(robot: int, t: np.ndarray) -> np.ndarray:
     return np.stack([x, y, (heading + np.pi) % (2 * np.pi) - np.pi], axis=-1)
 
 
-def command(robot: int) -> tuple[float, float]:
+def motion(robot: int) -> tuple[float, float]:
     """Return v m/s and omega rad/s."""
     return 0.1 + 0.01 * robot, 0.1 * (-1) ** robot
 
 
-def calibrated_command(robot: int) -> tuple[float, float]:
+def command(robot: int) -> tuple[float, float]:
     """Return the commanded v and omega that the nominal calibration turns into the motion."""
-    v, omega = command(robot)
-    commanded = omega / 0.93 + 0.006
-    return v / 1.04 / (1.0 - 0.5 * abs(commanded)), commanded
+    v, omega = motion(robot)
+    commanded = v, omega
+    for _ in range(50):  # a contraction
+        turn = omega / 0.936 / IROBOT_CREATE.gain(*commanded) + 0.005
+        commanded = v / (1.0 - abs(turn)), turn
+    return commanded
 
 
-def write(parent: Path, number: int = 6, seconds: float = 40.0, calibrated: bool = False) -> Path:
-    """Write a sub-dataset without noise and return its folder; `calibrated`: by commands of the nominal calibration."""
+def recorded_range(distance: float, bearing: float) -> float:
+    """Return what the camera records as a range: a depth along its optical axis, with a nominal scale and offset."""
+    return (1.022 * distance + 0.045) * math.cos(bearing)
+
+
+def write(parent: Path, number: int = 6, seconds: float = 40.0) -> Path:
+    """Write a sub-dataset without noise and return its folder; its commands are those of the nominal calibration."""
     folder = parent / f"MRCLAM_Dataset{number}"
     folder.mkdir()
     put(folder / "Barcodes.dat", [f"{s:3d} \t {b:4d}" for s, b in BARCODES.items()])
@@ -54,7 +61,7 @@ def write(parent: Path, number: int = 6, seconds: float = 40.0, calibrated: bool
         stamped = np.column_stack([ORIGIN + t, pose(robot, t)])
         rows = [f"{a:.3f} \t {x:.8f} \t {y:.8f} \t {h:.8f}" for a, x, y, h in stamped]
         put(folder / f"Robot{robot}_Groundtruth.dat", rows)
-        v, omega = calibrated_command(robot) if calibrated else command(robot)
+        v, omega = command(robot)
         t = np.arange(0.1, seconds - 0.5, 0.02)
         put(folder / f"Robot{robot}_Odometry.dat", [f"{ORIGIN + a:.3f} \t {v:.8f} \t {omega:.8f}" for a in t])
         put(folder / f"Robot{robot}_Measurement.dat", _sightings(robot, seconds))
@@ -72,7 +79,8 @@ def _sightings(robot: int, seconds: float) -> list[str]:
             dx, dy = point - (x, y)
             bearing = (np.arctan2(dy, dx) - heading + np.pi) % (2 * np.pi) - np.pi
             if abs(bearing) < 1.0:
-                row = f"{ORIGIN + time:.3f} \t {BARCODES[subject]:4d} \t {np.hypot(dx, dy):.8f} \t {bearing:.8f}"
+                depth = recorded_range(float(np.hypot(dx, dy)), bearing)
+                row = f"{ORIGIN + time:.3f} \t {BARCODES[subject]:4d} \t {depth:.8f} \t {bearing:.8f}"
                 rows.append(row)
     return rows
 
@@ -93,7 +101,7 @@ MISREAD = 0.004  # share of barcodes
 
 
 def barrier_robots(seed: int, seconds: float = 150.0, turn_scale: float = 0.6, barriers: int = 3) -> Dataset:
-    """Return a sub-dataset in which robots turn `turn_scale` times their commands."""
+    """Return a sub-dataset in which robots turn `turn_scale` times what their wheels make of commands."""
     rng = np.random.default_rng([9, seed])
     centre, angle = rng.uniform(LOW + 1, HIGH - 1, (barriers, 2)), rng.uniform(0, np.pi, barriers)
     half = rng.uniform(0.8, 1.6, barriers)[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -115,7 +123,8 @@ def _drive(rng: np.random.Generator, seconds: float, turn_scale: float) -> tuple
         t = k * DT
         if t >= until:
             command, until = _command(rng, x, t, scale)
-            came = command * (0.95 * rng.normal(1, 0.03), scale * rng.normal(1, 0.06))
+            turns = scale * IROBOT_CREATE.gain(*command.tolist())
+            came = command * (0.95 * rng.normal(1, 0.03), turns * rng.normal(1, 0.06))
             waiting.append((t + max(0.2 + 0.08 * rng.standard_normal(), DT), came))
         while waiting and t >= waiting[0][0]:
             wanted = waiting.pop(0)[1]
@@ -162,7 +171,8 @@ def _robot(
             near = 0.3 < math.hypot(dx, dy) < REACH_M and abs(bearing) < HALF_VIEW and subject != n + 1
             if near and rng.random() < 0.6 and not any(_crosses(poses[n, k, :2], point, *wall) for wall in walls):
                 who = subject if rng.random() > MISREAD else int(rng.integers(6, 21))
-                seen.append((k * DT, who, math.hypot(dx, dy), bearing + bias + 0.013 * rng.standard_normal()))
+                depth = recorded_range(math.hypot(dx, dy), bearing)
+                seen.append((k * DT, who, depth, bearing + bias + 0.013 * rng.standard_normal()))
     t = np.asarray(DT * np.arange(poses.shape[1]), dtype=np.float64)
     truth = MotionCapture(t, poses[n, :, :2], np.unwrap(poses[n, :, 2]))
     return Robot(n + 1, odometry, np.array(seen).reshape(-1, 4), truth, 0)
@@ -177,23 +187,3 @@ def _crosses(p: np.ndarray, q: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool
     s = ((a - p)[0] * v[1] - (a - p)[1] * v[0]) / det
     r = ((a - p)[0] * u[1] - (a - p)[1] * u[0]) / det
     return bool(0 < s < 1 and 0 < r < 1)
-
-
-def carried_off(seed: int, robot: int, at: float, seconds: float = 150.0) -> Recording:
-    """Return a record without sightings of robots in which one is carried, unfelt, to another place at a time in s.
-
-    From then on it is the robot of another record, whose odometry and bearings it has.
-    """
-    before, after = (recording_of(barrier_robots(s, seconds), "landmarks") for s in (seed, seed + 1000))
-    k = round(at / before.dt)
-    changed = {name: values.copy() for name, values in before.per_tick().items()}
-    for name in ("rotation", "translation", "velocity", "angular_velocity", "bearings", "visible"):
-        changed[name][k:, robot] = getattr(after, name)[k:, robot]
-    truth = replace(before.truth, rotation=before.truth.rotation.copy(), position=before.truth.position.copy())
-    truth.rotation[k:, robot], truth.position[k:, robot] = (
-        after.truth.rotation[k:, robot],
-        after.truth.position[k:, robot],
-    )
-    for array in changed.values():
-        array.setflags(write=False)
-    return replace(before, **changed, truth=truth)

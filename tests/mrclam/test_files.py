@@ -213,7 +213,7 @@ def test_held_commands_are_integrated_exactly(dataset):
     held = HeldCommands(replace(dataset.robots[0], odometry=odometry))
     t = np.array([0.0, 0.1, 0.35, 0.77, 1.2, 1.4, 3.0])
     fine = np.linspace(0.0, 3.0, 300_001)
-    v, w = held.commands(fine)
+    w, v = (np.diff(held.sums(fine), axis=0, append=np.nan) / 1e-5).T
     heading = np.concatenate([[0.0], np.cumsum(w[:-1]) * 1e-5])
     x = np.concatenate([[0.0], np.cumsum(v[:-1] * np.cos(heading[:-1])) * 1e-5])
     y = np.concatenate([[0.0], np.cumsum(v[:-1] * np.sin(heading[:-1])) * 1e-5])
@@ -226,8 +226,9 @@ def test_held_commands_are_integrated_exactly(dataset):
 def test_a_command_is_not_held_for_ever(dataset):
     held = HeldCommands(replace(dataset.robots[0], odometry=np.array([[0.0, 0.2, 0.5], [9.0, 0.1, 0.0]])))
     np.testing.assert_allclose(held.pose(np.array([1.0, 5.0, 20.0]))[:, 2], [0.5, 0.5 * MAX_HOLD_S, 0.5 * MAX_HOLD_S])
-    v, _ = held.commands(np.array([-1.0, 1.0, 5.0, 9.5, 20.0]))
-    assert v.tolist() == [0.0, 0.2, 0.0, 0.1, 0.0]
+    turned, driven = held.sums(np.array([-1.0, 1.0, 5.0, 9.5, 20.0])).T
+    np.testing.assert_allclose(turned, [0.0, 0.5, 1.0, 1.0, 1.0])
+    np.testing.assert_allclose(driven, [0.0, 0.2, 0.4, 0.45, 0.6])
 
 
 def test_detections_without_use_are_reported(tmp_path):

@@ -8,11 +8,12 @@ import pytest
 
 from coopenv.estimation.poses import Array, Coordinates, exp_so3
 from coopenv.measurements.kinds import Placed
-from coopenv.measurements.sensor import MAP
+from coopenv.measurements.sensor import MAP, Reading, kind_of
 from coopenv.measurements.table import KINDS
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Tick
+from coopenv.observers.correction import curvature
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import find
 from tests.helpers.readings import recorded, with_readings
@@ -115,6 +116,43 @@ def test_a_correction_by_a_kind_is_the_dense_one(base: Recording, kind: str, nam
     scale = np.sqrt(np.outer(np.diagonal(expected), np.diagonal(expected)))
     assert np.abs((P - expected) / scale).max() < 2e-3
     assert np.abs(information - np.linalg.inv(std**2 * F @ F.T)).max() > 0.0
+
+
+@pytest.mark.parametrize("name", ["bearing", "range"])
+def test_curvature_is_the_variance_of_what_linearisation_leaves(name: str) -> None:
+    kind, line, rng = kind_of(name), np.array([6.0, -3.0, 2.0]), np.random.default_rng(0)
+    u, t = line / 7.0, np.array([1.0, 2.0, 0.0]) / np.sqrt(5.0)  # along the line, and across it
+    errors = rng.normal(size=(20_000, 2)) * np.array([0.2, 0.3]) @ np.stack([u, t])
+    own, target = Placed.at(np.zeros(3)), Placed.at(line)
+    G = kind.jacobian(own, target)[1][:, 3:]
+    moved = kind.predict(own.repeated(len(errors)), Placed.at(line + errors))
+    left = kind.residual(moved, np.broadcast_to(kind.predict(own, target), moved.shape)) - errors @ G.T
+    angle = np.full((1, kind.rows), name == "bearing")
+    V = 0.04 * np.outer(u, u) + 0.09 * np.outer(t, t)
+    [found] = curvature(G[None], angle, line[None], V[None], np.array([5.0]))
+    if name == "range":
+        assert found == pytest.approx(5.0 * left.var(axis=0), rel=0.05)
+    else:  # each row counts the error across the line in any direction
+        assert found == pytest.approx(np.full(2, 5.0 * left.var(axis=0).sum()), rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["mekf", "schmidt_kalman"])
+def test_ranges_in_a_plane_leave_the_height_uncertain(base: Recording, name: str) -> None:
+    """The start is one standard deviation too high; ranges without noise hardly depend on the height."""
+    recording = with_readings(base, [{"kind": "range", "noise": 0.02, "towards": ["landmarks"]}])
+    setup, tick, place = recording.setups[0], first_tick(recording, 0), recording.truth.position[0, 0]
+    [sensor], still = setup.sensors, {"rotation": np.eye(3), "translation": np.zeros(3)}
+    landmarks = tick.landmarks * [1.0, 1.0, 0.0] + place * [0.0, 0.0, 1.0]
+    distances = np.linalg.norm(landmarks[sensor.targets] - place, axis=1)
+    observer = find(name)(setup)
+    observer.reset((np.eye(3), place + np.array([0.0, 0.0, 0.5])), np.diag([1e-6] * 3 + [0.25] * 3))
+    for k in range(1, 61):
+        changed = {"index": k, "time": k * tick.dt, "landmarks": landmarks}
+        estimate = observer.update(replace(tick, **still, **changed, readings=(Reading(sensor, distances[:, None]),)))
+    error, P = estimate.position - place, estimate.covariance
+    assert P is not None
+    assert error @ np.linalg.solve(P[3:, 3:], error) / 3.0 < 1.0
+    assert np.abs(error[:2]).max() < 0.02
 
 
 @pytest.mark.parametrize("joint", [True, False])

@@ -230,8 +230,21 @@ def test_invalid_messages_are_one_error_line(odd: Any, said: str) -> None:
 
 
 def test_an_observer_that_cannot_be_built_ends_its_run() -> None:
-    failure = run("planar_robust", recording()).failure
-    assert failure.startswith("at vehicle_1 at 0.000 s: CoopenvError: PlanarRobust is for robots on a plane")
+    class Unwilling(Probe):
+        def __init__(self, setup: Setup) -> None:
+            raise CoopenvError(f"no observer for {setup.name}")
+
+    assert run(Unwilling, recording()).failure == "at vehicle_1 at 0.000 s: CoopenvError: no observer for vehicle_1"
+
+
+@pytest.mark.parametrize(("former", "name"), sorted(registry.REPLACED.items()))
+def test_a_former_name_warns_and_gives_the_successor(former: str, name: str) -> None:
+    with pytest.warns(DeprecationWarning, match=f"observer '{former}' is now '{name}'"):
+        assert registry.find(former) is registry.find(name)
+    with pytest.warns(DeprecationWarning, match=f"'{name}'"):
+        assert registry.with_observer({}, former) == {"observer.name": name}
+    registry.check_known(former)
+    assert former not in registry.list_observers()
 
 
 SENSED = ("rotation", "translation", "velocity", "angular_velocity", "targets", "bearings", "valid", "landmarks")

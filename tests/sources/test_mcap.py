@@ -212,7 +212,7 @@ def test_command_records_robots(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert not capsys.readouterr().err
     if find_spec("viser"):
         page = path.with_suffix(".html").read_text(encoding="utf-8")
-        assert "mrclam_6, observer planar_robust" in page and "first" not in page.split("<details id")[1]
+        assert "mrclam_6, observer self_calibrating" in page and "first" not in page.split("<details id")[1]
     (tmp_path / "MRCLAM_Dataset6" / "Robot5_Measurement.dat").write_text("")
     assert main(["record", "mrclam_6", *data, "--force", "--out", str(path)]) == 0
     assert capsys.readouterr().err == "warning: mrclam_6: no detections of robot 5\n"

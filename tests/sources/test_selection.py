@@ -76,7 +76,7 @@ def test_robots_that_are_left_out_have_no_part(whole: Recording, data: Path) -> 
     assert found.setups[0].targets.tolist() == [0, 1, 2, 3, 4, 7]
     assert not found.visible[:, [1, 3, 4]].any() and not found.visible[..., [6, 8, 9]].any()
     assert not np.isfinite(found.truth.position[:, [1, 3, 4]]).any()
-    board = compare(["planar_ekf"], "mrclam_6", data=data, robots=[3, 1], variants=["landmarks"])
+    board = compare(["mekf_covariance"], "mrclam_6", data=data, robots=[3, 1], variants=["landmarks"])
     assert [row.vehicle for row in board.rows] == ["vehicle_1", "vehicle_3"] and "Not judged" not in str(board)
 
 
@@ -105,7 +105,7 @@ def test_the_commands_take_a_part(data: Path, tmp_path: Path, capsys: pytest.Cap
     assert main(["run", *given, "--no-figures", "--out", str(tmp_path / "out"), "--observer", "riccati"]) == 0
     printed = capsys.readouterr().out
     assert "vehicle_1, vehicle_3, vehicle_5: left out" in printed and "horizon reached at 2 s" in printed
-    bench = ["bench", "observers", *given, "--observers", "planar_ekf", "--jobs", "1"]
+    bench = ["bench", "observers", *given, "--observers", "mekf_covariance", "--jobs", "1"]
     assert main([*bench, "--variants", "landmarks", "--seeds", "3", "--out", str(tmp_path / "board")]) == 0
     printed, warned = capsys.readouterr()
     assert "f2" in printed and "f1" not in printed

@@ -316,11 +316,10 @@ def test_observers_are_compared_where_they_are_meant_to_be() -> None:
     def names(source: str, observers: str | None = None) -> tuple[str, ...]:
         return ObserverOptions(source=source, observers=observers).plan().observers
 
-    space, plane = names("overtaking"), names("mrclam_6")
-    assert names("mrclam_6_space") == space
-    assert not {"planar_ekf", "planar_robust"} & {*space} and {"p3p", "robust"} <= {*space}
-    assert not {"p3p", "robust"} & {*plane} and {"planar_ekf", "planar_robust", "riccati"} <= {*plane}
-    assert names("overtaking", "planar_ekf,mekf,mekf") == ("planar_ekf", "mekf")
+    assert names("mrclam_6_space") == names("mrclam_6") == names("overtaking")
+    assert {"p3p", "robust", "self_calibrating"} <= {*names("overtaking")}
+    with pytest.warns(DeprecationWarning, match="planar_ekf"):
+        assert names("overtaking", "planar_ekf,mekf,mekf") == ("mekf_covariance", "mekf")
 
 
 @pytest.mark.parametrize("name", ["mrclam_6", "mrclam_6_space"])

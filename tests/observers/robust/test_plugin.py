@@ -83,7 +83,7 @@ def test_a_lost_vehicle_sends_nothing_and_finds_its_place_again():
 def test_robots_on_a_plane_are_pointed_to_their_observer():
     setup = small_errors(12.0).setups[0]
     assert isinstance(find("robust")(setup), KernelObserver)
-    with pytest.raises(CoopenvError, match=r"'robust' is for vehicles in space.* use 'planar_robust'"):
+    with pytest.raises(CoopenvError, match=r"'robust' is for vehicles in space.* use 'self_calibrating'"):
         find("robust")(replace(setup, planar=True))
 
 
