@@ -43,7 +43,7 @@ def across(u: Array) -> Array:
 
 
 def linearise(R: Array, p: Array, frame: Frame) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Return residual, H, N and `ahead` of bearings of the camera, as `linearisation.linearise` does of a left error."""
+    """Return residual, H, N and `ahead` of the camera's bearings, as `linearisation.linearise` does of a left error."""
     entries, sensors, weight, _ = frame
     a = (entries["position"] - p).dot(R)
     d = a - sensors["position"][0]
