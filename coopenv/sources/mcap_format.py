@@ -110,17 +110,27 @@ SensorHeader = _section_of(
     rotation=Matrix3,
 )
 Row3 = tuple[Number | None, Number | None, Number | None]  # None: not known
-SetupHeader = _section_of(
-    Setup,
-    landmarks=Index,
-    targets=tuple[Index, ...],
-    lever_arm=Vector3,
-    marker=Vector3,
-    noise=_section_of(SensorNoise),
-    gains=_section_of(Gains, q=tuple[Number, ...]),
-    sensors=tuple[SensorHeader, ...],  # type: ignore[valid-type]
-    landmark_rotation=tuple[tuple[Row3, Row3, Row3], ...] | None,
-)
+
+
+class SetupHeader(
+    _section_of(  # type: ignore[misc]
+        Setup,
+        landmarks=Index,
+        targets=tuple[Index, ...],
+        lever_arm=Vector3,
+        marker=Vector3,
+        noise=_section_of(SensorNoise),
+        gains=_section_of(Gains, q=tuple[Number, ...]),
+        sensors=tuple[SensorHeader, ...],  # type: ignore[valid-type]
+        landmark_rotation=tuple[tuple[Row3, Row3, Row3], ...] | None,
+    )
+):
+    """A `Setup`, and what earlier versions wrote of it."""
+
+    planar: bool = False
+    """True for a robot on a plane whose odometry is its commands; such logs are refused."""
+
+
 ONLY_WITH_SENSORS = ("sensors", "landmark_rotation")
 """Entries of a setup that the header of a recording without sensors beside cameras does not have."""
 
@@ -195,7 +205,11 @@ def _setup(header: Any) -> Setup:
         "sensors": tuple(_sensor(sensor) for sensor in header.sensors),
         "landmark_rotation": header.landmark_rotation and np.array(header.landmark_rotation, float),
     }
-    return Setup(**{**dict(header), **arrays})
+    values = {**dict(header), **arrays}
+    if values.pop("planar"):
+        recorded = "recorded with an earlier version: robots on a plane whose odometry is their commands"
+        raise CoopenvError(f"{recorded}; convert the data set again")
+    return Setup(**values)
 
 
 def _sensor(header: Any) -> Sensor:
