@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.estimation.poses import Array, exp_so3, lengths, orthonormalise, right_jacobian, skew, solve
-from coopenv.observers import frame, uncertain_pose
-from coopenv.observers.correction import Stacked
+from coopenv.observers import uncertain_pose
+from coopenv.observers.correction import LARGEST, Judgement, Stacked
 from coopenv.observers.frame import Frame
 from coopenv.observers.pose_filters import Mekf
 from coopenv.observers.recording import Recording
@@ -42,24 +42,35 @@ def across(u: Array) -> Array:
     return np.stack(rows, axis=-1).reshape(-1, 2, 3)
 
 
-def linearise(
-    R: Array, p: Array, right: bool, lever_arm: Array, bearings: Array, positions: Array, C: Array, variance: float
-) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
-    """Return what `frame.linearise` does of a left error."""
-    a = (positions - p).dot(R)
-    d = a - lever_arm
+def linearise(R: Array, p: Array, frame: Frame) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Return residual, H, N and `ahead` of the camera's bearings, as `linearisation.linearise` does of a left error."""
+    entries, sensors, weight, _ = frame
+    a = (entries["position"] - p).dot(R)
+    d = a - sensors["position"][0]
     distance = np.maximum(lengths(d), 1e-9)[:, None]
     B = across(d / distance)
     J = B / distance[..., None]
-    G = J.dot(R.T)
+    axes = entries["rotation"].copy()
+    axes[~axes.any(axis=(1, 2))] = np.eye(3)
+    G = J.dot(R.T) @ axes
     H = np.concatenate([J @ skew(a), -J], axis=-1)
-    N = G @ C @ G.transpose(0, 2, 1) + variance * np.eye(2)
-    return (B @ bearings[..., None])[..., 0], H, N, G, (d * bearings).sum(axis=1) > 0.0
+    N = weight * G @ entries["covariance"][:, 3:, 3:] @ G.transpose(0, 2, 1) + sensors["variance"][0, 0] * np.eye(2)
+    bearings = entries["value"][:, :3]
+    return (B @ bearings[..., None])[..., 0], H, N, (d * bearings).sum(axis=1) > 0.0
+
+
+def judged(kind: int, R: Array, p: Array, P: Array, frame: Frame, *unused: object) -> Judgement:
+    """Return what `correction.judged_frame` does of bearings of the camera."""
+    residual, H, N, ahead = linearise(R, p, frame)
+    S = H.dot(P) @ H.transpose(0, 2, 1) + N
+    squared = np.einsum("mr,mr->m", residual, np.linalg.solve(S, residual[..., None])[..., 0])
+    fits = (squared >= 0.0) & (squared <= LARGEST) & ahead
+    return squared >= 0.0, fits, 1.0 - float(fits.mean()), float(np.trace(S, axis1=1, axis2=2).max())
 
 
 def stacked(R: Array, p: Array, frame: Frame) -> Stacked:
     """Return residual (2m,), H (2m, 6) and N (2m, 2m) at a pose."""
-    residual, H, N, *_ = linearise(R, p, False, *frame)
+    residual, H, N, _ = linearise(R, p, frame)
     m, dense = np.arange(len(N)), np.zeros((len(N), 2, len(N), 2))
     dense[m, :, m, :] = N
     return residual.ravel(), H.reshape(-1, 6), dense.reshape(2 * len(N), -1)
@@ -79,7 +90,7 @@ def recentring(dx: Array) -> Array:
     return G
 
 
-def updated(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, float]:
+def updated(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, float, int]:
     """Return what `correction.updated` does of a left error."""
     residual, H, N = stacked(R, p, frame)
     _, dx, nis = gain(P, H, N, residual)
@@ -89,7 +100,7 @@ def updated(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Arra
     K, dx, _ = gain(P, H, N, residual + H.dot(at))
     A, G = np.eye(6) - K.dot(H), recentring(dx)
     P = G.dot(A.dot(P).dot(A.T) + K.dot(N).dot(K.T)).dot(G.T)
-    return R.dot(exp_so3(dx[:3])), p + R.dot(dx[3:]), (P + P.T) / 2, nis
+    return R.dot(exp_so3(dx[:3])), p + R.dot(dx[3:]), (P + P.T) / 2, nis, len(N)
 
 
 def measured(recording: Recording) -> tuple[Run, float]:
@@ -106,9 +117,8 @@ def main() -> None:
     """Print both times and their ratio."""
     recording = record(load_scenario("lane:8", {"horizon": 12.0}))
     compiled, numba = measured(recording)
-    uncertain_pose.predicted, frame.linearise = predicted, linearise
-    frame.spread = lambda H, P, N: H.dot(P) @ H.transpose(0, 2, 1) + N
-    vars(sys.modules[Mekf.__module__])["updated"] = updated
+    uncertain_pose.predicted = predicted
+    vars(sys.modules[Mekf.__module__]).update(updated=updated, judged_frame=judged)
     plain, numpy = measured(recording)
     difference = float(np.abs(plain.position[1:] - compiled.position[1:]).max())
     print(f"{OBSERVER}, lane:8, 12 s: Numba {numba:.2f} s of CPU, NumPy {numpy:.2f} s, factor {numpy / numba:.1f}")

@@ -14,18 +14,12 @@ from coopenv.estimation.compiled import NUMBER, WHOLE
 from coopenv.estimation.poses import IDENTITY, Array
 from coopenv.measurements.kinds import MOST_ROWS
 from coopenv.measurements.sensor import MAP, Sensor
+from coopenv.measurements.table import KINDS
 from coopenv.observers.contract import Message, Tick
 
 CAMERA = 0  # number of the camera among the sensors of a vehicle
 OWN_KIND, BEARING, RANGE, RANGE_BEARING, POSITION, ATTITUDE, RELATIVE_POSE = range(7)
-COMPILED = {
-    "bearing": BEARING,
-    "range": RANGE,
-    "range_bearing": RANGE_BEARING,
-    "position": POSITION,
-    "attitude": ATTITUDE,
-    "relative_pose": RELATIVE_POSE,
-}
+COMPILED = dict(zip(KINDS, range(BEARING, RELATIVE_POSE + 1), strict=False))
 """Kinds that compiled functions linearise; any other kind is linearised by its own functions in NumPy."""
 BEARING_ROWS = 2
 UNKNOWN_ANGLE = 0.5  # rad, a standard deviation from which on a sensor does not measure an angle

@@ -2,12 +2,11 @@
 
 The tick of a message is its sequence number. Standard ROS 2 messages serve viewers; what is read back stands in
 messages of this project, in full precision. The header `recording.json` holds what is constant over a recording:
-setups, gains, noise, starts, scenario. `metadata_names` and `is_cut_off` look into a file without the MCAP library.
+setups, gains, noise, starts, scenario. `is_cut_off` looks into a file without the MCAP library.
 """
 
 import json
 import math
-import struct
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
@@ -224,8 +223,6 @@ def _sensor(header: Any) -> Sensor:
 
 
 MAGIC = b"\x89MCAP0\r\n"
-_METADATA, _ATTACHMENT, _HEADER = 0x0C, 0x09, 0x01
-MOST_RECORDS = 16
 
 CUT_OFF = "cut off, the end of the MCAP file is missing"
 REPAIR = "mcap recover"
@@ -241,28 +238,6 @@ def is_cut_off(path: Path) -> bool:
         size = stream.seek(0, 2)
         stream.seek(max(0, size - len(MAGIC)))
         return size < 2 * len(MAGIC) or stream.read() != MAGIC
-
-
-def metadata_names(path: str | Path) -> frozenset[str] | None:
-    """Return the names of the metadata that stand before a file's data; None: it cannot be read or is no MCAP file."""
-    names = set()
-    try:
-        with regular(path).open("rb") as stream:
-            if stream.read(len(MAGIC)) != MAGIC:
-                return None
-            for _ in range(MOST_RECORDS):
-                kind, size = struct.unpack("<BQ", stream.read(9))
-                if kind == _METADATA:
-                    (length,) = struct.unpack("<I", stream.read(4))
-                    names.add(stream.read(min(length, 256)).decode("utf-8", "replace"))
-                    stream.seek(size - 4 - min(length, 256), 1)
-                elif kind in (_HEADER, _ATTACHMENT):
-                    stream.seek(size, 1)
-                else:
-                    break
-    except (OSError, ValueError, OverflowError, struct.error):  # cut off within its first records
-        return frozenset(names) if names else None
-    return frozenset(names)
 
 
 @contextmanager

@@ -5,10 +5,15 @@ Rows of the table of sources, which are read whenever a name is looked up: all e
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
+from coopenv.base.errors import regular
 from coopenv.base.installation import BAGS
 from coopenv.sources.registry import LOG_SUFFIX, SourceKind, no_name
+
+_METADATA, _ATTACHMENT, _HEADER = 0x0C, 0x09, 0x01  # records of MCAP
+MOST_RECORDS = 16
 
 DRIVE_METADATA = "coopenv-drive"
 """Name of the metadata of drives."""
@@ -25,7 +30,7 @@ def is_bag(name: str, topics: str | Path | None = None) -> bool:
     if name.endswith(BAGS):
         return True
     if name.endswith(LOG_SUFFIX):
-        metadata = _metadata_of(name)
+        metadata = metadata_names(name)
         if metadata is None or DRIVE_METADATA in metadata:
             return topics is not None
         return not metadata & OURS
@@ -37,13 +42,31 @@ def is_bag(name: str, topics: str | Path | None = None) -> bool:
 
 def is_drive(name: str, topics: str | Path | None = None) -> bool:
     """Return whether a file is a recorded drive; False where it cannot be read, or with a map, as which it is a bag."""
-    return topics is None and name.endswith(LOG_SUFFIX) and DRIVE_METADATA in (_metadata_of(name) or ())
+    return topics is None and name.endswith(LOG_SUFFIX) and DRIVE_METADATA in (metadata_names(name) or ())
 
 
-def _metadata_of(name: str) -> frozenset[str] | None:
-    from coopenv.sources.mcap_format import metadata_names
+def metadata_names(path: str | Path) -> frozenset[str] | None:
+    """Return the names of the metadata that stand before a file's data; None: it cannot be read or is no MCAP file."""
+    from coopenv.sources.mcap_format import MAGIC  # which other commands do not need
 
-    return metadata_names(name)
+    names = set()
+    try:
+        with regular(path).open("rb") as stream:
+            if stream.read(len(MAGIC)) != MAGIC:
+                return None
+            for _ in range(MOST_RECORDS):
+                kind, size = struct.unpack("<BQ", stream.read(9))
+                if kind == _METADATA:
+                    (length,) = struct.unpack("<I", stream.read(4))
+                    names.add(stream.read(min(length, 256)).decode("utf-8", "replace"))
+                    stream.seek(size - 4 - min(length, 256), 1)
+                elif kind in (_HEADER, _ATTACHMENT):
+                    stream.seek(size, 1)
+                else:
+                    break
+    except (OSError, ValueError, OverflowError, struct.error):  # cut off within its first records
+        return frozenset(names) if names else None
+    return frozenset(names)
 
 
 SVEA = SourceKind(

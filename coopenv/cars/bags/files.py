@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, error_text, listed, printable
 from coopenv.base.installation import install_command
-from coopenv.sources.mcap_format import MAGIC, REPAIR, metadata_names
+from coopenv.cars.backend.sources import metadata_names
+from coopenv.sources.mcap_format import MAGIC, REPAIR
 
 if TYPE_CHECKING:
     from coopenv.cars.bags.definitions import BagChannel

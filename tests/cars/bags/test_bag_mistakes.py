@@ -19,7 +19,7 @@ from numpy.testing import assert_allclose
 
 from coopenv import CoopenvError, DataError
 from coopenv.base.errors import DataWarning
-from coopenv.cars.backend.sources import BAG
+from coopenv.cars.backend.sources import BAG, metadata_names
 from coopenv.cars.bags import files, streams
 from coopenv.cars.bags.bag import Bag
 from coopenv.cars.bags.files import BagFile
@@ -31,7 +31,6 @@ from coopenv.cli.app import main
 from coopenv.estimation.poses import exp_so3
 from coopenv.scenario import load_scenario
 from coopenv.sources import mcap_container as container
-from coopenv.sources.mcap_format import metadata_names
 from coopenv.sources.registry import ENVIRONMENT, LOG, kind_of
 from tests.helpers import bags
 from tests.helpers.bags import MAP
