@@ -109,10 +109,9 @@ SensorHeader = _section_of(
     rotation=Matrix3,
 )
 Row3 = tuple[Number | None, Number | None, Number | None]  # None: not known
-
-
-class SetupHeader(
-    _section_of(  # type: ignore[misc]
+SetupHeader = create_model(
+    "SetupHeader",
+    __base__=_section_of(
         Setup,
         landmarks=Index,
         targets=tuple[Index, ...],
@@ -122,14 +121,9 @@ class SetupHeader(
         gains=_section_of(Gains, q=tuple[Number, ...]),
         sensors=tuple[SensorHeader, ...],  # type: ignore[valid-type]
         landmark_rotation=tuple[tuple[Row3, Row3, Row3], ...] | None,
-    )
-):
-    """A `Setup`, and what earlier versions wrote of it."""
-
-    planar: bool = False
-    """True for a robot on a plane whose odometry is its commands; such logs are refused."""
-
-
+    ),
+    planar=(bool, False),  # earlier versions wrote it: true of robots on a plane whose odometry is their commands
+)
 ONLY_WITH_SENSORS = ("sensors", "landmark_rotation")
 """Entries of a setup that the header of a recording without sensors beside cameras does not have."""
 
@@ -143,7 +137,7 @@ class RecordingHeader(Section):
     period: int
     staleness: Number | None
     """s; none: messages are used for ever."""
-    setups: tuple[SetupHeader, ...] = Field(min_length=1)  # type: ignore[valid-type]
+    setups: tuple[SetupHeader, ...] = Field(min_length=1)
     start_rotation: tuple[Matrix3, ...]
     start_position: tuple[Vector3, ...]
     start_covariance: tuple[Matrix6, ...]
