@@ -69,12 +69,10 @@ def _page(name: str, entry: ZooEntry, about: str, sends: str) -> str:
         f"Source: `{file}`.",
         _where(entry),
     ]
-    facts += [] if entry.in_space else ["Only for recorded robots on a plane."]
-    facts += [] if entry.on_a_plane else ["Only for vehicles in space, not for recorded robots on a plane."]
     facts += [f"Needs `{entry.needs}`: `pip install '.[bench]'`."] if entry.needs else []
     use = f'import coopenv\n\nenv = coopenv.parallel_env("busy_intersection_tracking", observer="{name}")'
     joint = getattr(_class(entry), "joint", False)
-    shown = [] if joint or not entry.in_space else ["## In an environment", f"```python\n{use}\n```"]
+    shown = [] if joint else ["## In an environment", f"```python\n{use}\n```"]
     return (
         "\n\n".join(
             [

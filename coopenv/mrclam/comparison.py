@@ -23,11 +23,6 @@ class Robots(RecordSource):
     usual: ClassVar[tuple[str, ...]] = tuple(MRCLAM.variants)
     windowed: ClassVar[bool] = False
 
-    @property
-    def planar(self) -> bool:
-        """False: commands are calibrated to odometry, so that observers for vehicles in space suit the robots."""
-        return False
-
     def world(self) -> Recording:
         """Return the robots' record."""
         return open_recording(self.name, self.data, None, self.selection)

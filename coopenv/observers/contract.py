@@ -126,9 +126,6 @@ class Setup:
     marker: Array  # (3,) the point of this vehicle that others' cameras measure, in its body, m
     noise: SensorNoise  # standard deviations of what this vehicle senses
     gains: Gains  # of the Riccati observer
-    planar: bool = False
-    """True for a vehicle that moves on a plane (z = 0, yaw only) and whose odometry is its commands, which need
-    calibration, such as recorded robots."""
     optical_axis: tuple[float, float, float] = (1.0, 0.0, 0.0)
     """Unit vector of the camera in the body frame, from which a wrong focal length moves bearings away."""
     sensors: tuple[Sensor, ...] = ()  # beside the camera
@@ -326,12 +323,11 @@ def check_message(message: Message) -> None:
         _checked_numbers(name, value)
 
 
-def check_received(message: Message, planar: bool = False) -> None:
+def check_received(message: Message) -> None:
     """Refuse a message that a receiver cannot use with a CoopenvError: its sender may be faulty or hostile.
 
     In addition to `check_message`: a matrix that is no rotation, a covariance that is not positive definite or not of a
-    plausible size, and numbers that are not finite. The covariance of a robot on a plane may be semidefinite, because
-    its height is known.
+    plausible size, and numbers that are not finite.
     """
     position, R, P = _check_pose(message)
     if position is not None and np.abs(position).max() > FARTHEST:
@@ -340,8 +336,7 @@ def check_received(message: Message, planar: bool = False) -> None:
         _check_rotation(R)
     if P is not None:
         _check_covariance(P)
-        implausible = P.diagonal().max() > LARGEST_VARIANCE
-        if implausible or not (planar or is_definite(P, LEAST_VARIANCE, LARGEST_VARIANCE)):
+        if P.diagonal().max() > LARGEST_VARIANCE or not is_definite(P, LEAST_VARIANCE, LARGEST_VARIANCE):
             raise CoopenvError("message: covariance is not positive definite, or not plausible")
     for name, value in message.extra.items():
         numbers = _checked_numbers(name, value)  # a sum of squares is faster, but may overflow
@@ -410,7 +405,7 @@ def _check_covariance(P: Array) -> None:
     if not _is_symmetric(P):
         raise CoopenvError("covariance is not symmetric")
     if dpotrf(P)[1] == 0 or dpotrf(P + MOST_NEGATIVE * P.diagonal().max() * np.eye(len(P)))[1] == 0:
-        return  # the second condition is for singular matrices, as of robots on a plane
+        return  # the second condition is for singular matrices, as of a known height
     eigenvalues = np.linalg.eigvalsh(P)
     if eigenvalues[0] < -MOST_NEGATIVE * eigenvalues[-1]:
         raise CoopenvError("covariance is not positive semidefinite")

@@ -59,7 +59,7 @@ class Mailbox:
             message = before.get(max(k - replay, 0), message)
             while (oldest := next(iter(before))) < k - kept:
                 del before[oldest]
-        sent[k] = self._valid_copy(vehicle, message)
+        sent[k] = _valid_copy(message)
         while (oldest := next(iter(sent))) < k - self.observer_init.flight - 1:
             del sent[oldest]
         if k > 0:
@@ -87,7 +87,7 @@ class Mailbox:
             sender = target - landmarks
             sent, last = ticks[sender], lasts.get(sender)
             if (vehicle, sender) in arrived:
-                self._receive(vehicle, sender, sent, self._valid_copy(sender, arrived[vehicle, sender].message), sent)
+                self._receive(vehicle, sender, sent, _valid_copy(arrived[vehicle, sender].message), sent)
             elif sent in self.sent[sender] and (last is None or last.sent != sent):
                 stamp = sent if ahead is None else min(max(sent + ahead[sender] - ahead[vehicle], 0), k)
                 self._receive(vehicle, sender, sent, self.sent[sender][sent], stamp)
@@ -108,18 +108,6 @@ class Mailbox:
                 return
         self.refused[vehicle] += 1
         lasts[sender] = lasts.get(sender, LastReceived(sent, None, stamp))._replace(sent=sent)
-
-    def _valid_copy(self, sender: int, message: Any) -> Message | None:
-        """Return a read-only copy of a message; None if it is invalid."""
-        try:
-            if _size(message) > MOST_CONTENTS:
-                return None
-            p, R, P = map(_floats, (message.position, message.rotation, message.covariance))
-            copied = Message(p, R, P, {name: sealed(np.array(value)) for name, value in message.extra.items()})
-            check_received(copied, self.observer_init.setups[sender].planar)
-        except (CoopenvError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError):
-            return None
-        return copied
 
     def get_state(self) -> dict[str, Any]:
         """Return the sent and received messages, the expected forms and the counts."""
@@ -155,6 +143,19 @@ def _size(message: Any) -> int:
         return int(message.size_bytes)
     except (ValueError, TypeError, AttributeError):
         return 0
+
+
+def _valid_copy(message: Any) -> Message | None:
+    """Return a read-only copy of a message; None if it is invalid."""
+    try:
+        if _size(message) > MOST_CONTENTS:
+            return None
+        p, R, P = map(_floats, (message.position, message.rotation, message.covariance))
+        copied = Message(p, R, P, {name: sealed(np.array(value)) for name, value in message.extra.items()})
+        check_received(copied)
+    except (CoopenvError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError):
+        return None
+    return copied
 
 
 def _checked(message: Message | None) -> Message | None:

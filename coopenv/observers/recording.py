@@ -194,8 +194,6 @@ class Recording(Measurements):
     @property
     def on_a_plane(self) -> bool:
         """True if recorded robots drive on the plane z = 0, so that errors out of it vanish and are not judged."""
-        if all(setup.planar for setup in self.setups):
-            return True
         return self.scenario is None and not np.nan_to_num(self.truth.position[..., 2]).any()
 
     @property
@@ -346,8 +344,8 @@ def _check_setups(setups: Sequence[Setup]) -> None:
 
 
 def _check_setup(setup: Setup, vehicle: int, first: Setup, where: str) -> None:
-    same = (setup.target_names, setup.landmarks, setup.planar) == (first.target_names, first.landmarks, first.planar)
-    _require(same, f"{where}: other names, landmarks or plane than the first vehicle's")
+    same = (setup.target_names, setup.landmarks) == (first.target_names, first.landmarks)
+    _require(same, f"{where}: other names or landmarks than the first vehicle's")
     _require(setup.vehicle == vehicle, f"{where}.vehicle: {setup.vehicle} instead of {vehicle}")
     own, targets = setup.landmarks + vehicle, setup.targets.tolist()
     _require(setup.name == setup.target_names[own], f"{where}.name: not the name of target {own}")

@@ -34,9 +34,6 @@ class ZooEntry:
     plugin: str  # module and class, or function of a setup; the first sentence of its docstring stands in tables
     kernels: str = ""  # module and `Embedded`; empty: it runs on the host only
     needs: str = ""  # module of the extra `bench` without which it does not run
-    in_space: bool = True  # whether it is meant for vehicles in space
-    on_a_plane: bool = True
-    """True if it is meant for robots on a plane whose odometry is their commands (`Setup.planar`)."""
     of_robots: bool = False  # whether it is that of a recording of robots where none is named
     covariance: bool = True  # whether its P is meant as a covariance, and is no matrix of gains
     package: str = "coopenv.observers"  # of its modules
@@ -44,8 +41,7 @@ class ZooEntry:
 
 ZOO = {
     "dead_reckoning": ZooEntry("pose_filters:DeadReckoning", "riccati:DEAD_RECKONING"),
-    # on a plane, bearings to three points overdetermine the pose
-    "p3p": ZooEntry("pose_filters:PerspectivePoints", on_a_plane=False),
+    "p3p": ZooEntry("pose_filters:PerspectivePoints"),
     "riccati": ZooEntry("riccati:riccati", "riccati:RICCATI", covariance=False),
     "hamel_samson": ZooEntry("pose_filters:HamelSamson", covariance=False),
     "mekf": ZooEntry("pose_filters:Mekf"),
@@ -62,13 +58,13 @@ ZOO = {
     "distributed_invariant": ZooEntry("covariance_intersection:DistributedInvariant"),
     "ukf": ZooEntry("pose_filters:Ukf"),
     "factor_graph": ZooEntry("factor_graph:FactorGraph", needs="gtsam"),
-    "robust": ZooEntry("robust.observer:robust", "robust.observer:ROBUST", on_a_plane=False),
+    "robust": ZooEntry("robust.observer:robust", "robust.observer:ROBUST"),
     "centralised": ZooEntry("centralised:Centralised"),
     "first_estimates_ekf": ZooEntry("centralised:FirstEstimatesEkf"),
     "observability_constrained_ekf": ZooEntry("centralised:ObservabilityConstrainedEkf"),
-    "belief_propagation": ZooEntry("belief_propagation:BeliefPropagation", on_a_plane=False),
-    "smoother": ZooEntry("smoother:Smoother", on_a_plane=False),
-    "fixed_lag_smoother": ZooEntry("smoother:FixedLagSmoother", on_a_plane=False),
+    "belief_propagation": ZooEntry("belief_propagation:BeliefPropagation"),
+    "smoother": ZooEntry("smoother:Smoother"),
+    "fixed_lag_smoother": ZooEntry("smoother:FixedLagSmoother"),
 }
 """Observers of this package by name; `zoo` has those of coopenv's guests, too."""
 
@@ -253,12 +249,9 @@ def obstacle(name: str) -> str:
     return ""
 
 
-def available_names(planar: bool | None = None) -> list[str]:
-    """Return the names that can be used here; `planar`: only those for robots on a plane, or for vehicles in space."""
-    both = planar is None
-    strangers = {name for name, row in zoo().items() if not (both or (row.on_a_plane if planar else row.in_space))}
-    names = sorted({*list_observers(), *_registered})
-    return [name for name in names if name not in strangers and not obstacle(name)]
+def available_names() -> list[str]:
+    """Return the names that can be used here."""
+    return [name for name in sorted({*list_observers(), *_registered}) if not obstacle(name)]
 
 
 def find(name: str | Factory) -> Factory:
@@ -277,16 +270,13 @@ def find(name: str | Factory) -> Factory:
     return row.factory or _attribute("kernel_observer:KernelFactory")(row.embedded)
 
 
-def find_embedded(name: str, planar: bool = False) -> Embedded | None:
-    """Return the kernels of an observer by name, None where it has none; errors are those of `find`.
-
-    `planar` is for robots on a plane whose odometry is their commands.
-    """
+def find_embedded(name: str) -> Embedded | None:
+    """Return the kernels of an observer by name, None where it has none; errors are those of `find`."""
     name = current(name)
     row = zoo().get(name)
     if row is None:
         return _found(name).embedded
-    return _attribute(row.kernels, row.package) if row.kernels and (row.on_a_plane or not planar) else None
+    return _attribute(row.kernels, row.package) if row.kernels else None
 
 
 def _attribute(place: str, package: str = __package__) -> Any:

@@ -109,16 +109,20 @@ SensorHeader = _section_of(
     rotation=Matrix3,
 )
 Row3 = tuple[Number | None, Number | None, Number | None]  # None: not known
-SetupHeader = _section_of(
-    Setup,
-    landmarks=Index,
-    targets=tuple[Index, ...],
-    lever_arm=Vector3,
-    marker=Vector3,
-    noise=_section_of(SensorNoise),
-    gains=_section_of(Gains, q=tuple[Number, ...]),
-    sensors=tuple[SensorHeader, ...],  # type: ignore[valid-type]
-    landmark_rotation=tuple[tuple[Row3, Row3, Row3], ...] | None,
+SetupHeader = create_model(
+    "SetupHeader",
+    __base__=_section_of(
+        Setup,
+        landmarks=Index,
+        targets=tuple[Index, ...],
+        lever_arm=Vector3,
+        marker=Vector3,
+        noise=_section_of(SensorNoise),
+        gains=_section_of(Gains, q=tuple[Number, ...]),
+        sensors=tuple[SensorHeader, ...],  # type: ignore[valid-type]
+        landmark_rotation=tuple[tuple[Row3, Row3, Row3], ...] | None,
+    ),
+    planar=(bool, False),  # earlier versions wrote it: true of robots on a plane whose odometry is their commands
 )
 ONLY_WITH_SENSORS = ("sensors", "landmark_rotation")
 """Entries of a setup that the header of a recording without sensors beside cameras does not have."""
@@ -133,7 +137,7 @@ class RecordingHeader(Section):
     period: int
     staleness: Number | None
     """s; none: messages are used for ever."""
-    setups: tuple[SetupHeader, ...] = Field(min_length=1)  # type: ignore[valid-type]
+    setups: tuple[SetupHeader, ...] = Field(min_length=1)
     start_rotation: tuple[Matrix3, ...]
     start_position: tuple[Vector3, ...]
     start_covariance: tuple[Matrix6, ...]
@@ -194,7 +198,11 @@ def _setup(header: Any) -> Setup:
         "sensors": tuple(_sensor(sensor) for sensor in header.sensors),
         "landmark_rotation": header.landmark_rotation and np.array(header.landmark_rotation, float),
     }
-    return Setup(**{**dict(header), **arrays})
+    values = {**dict(header), **arrays}
+    if values.pop("planar"):
+        recorded = "recorded with an earlier version: robots on a plane whose odometry is their commands"
+        raise CoopenvError(f"{recorded}; convert the data set again")
+    return Setup(**values)
 
 
 def _sensor(header: Any) -> Sensor:

@@ -394,7 +394,7 @@ class Replay(TickGenerator):
 
     def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> ReplayWorld:
         """Return worlds that go through the recording."""
-        observer = find_embedded(self.scenario.observer.name, self.recording.on_a_plane) or HOST
+        observer = find_embedded(self.scenario.observer.name) or HOST
         covariance = self.recording.start_covariance
         return ReplayWorld(self.recording, self.scenario, worlds, dtype, device, threads, observer, covariance)
 

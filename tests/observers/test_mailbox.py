@@ -19,7 +19,7 @@ LANDMARKS = 2
 def mailbox(vehicles: int = 3, staleness: float = 1.0, flight: int = 2) -> Mailbox:
     """Return the mailbox of vehicles that all hear one another."""
     targets = np.arange(LANDMARKS + vehicles)
-    setups = [SimpleNamespace(landmarks=LANDMARKS, targets=targets, planar=False) for _ in range(vehicles)]
+    setups = [SimpleNamespace(landmarks=LANDMARKS, targets=targets) for _ in range(vehicles)]
     init: Any = SimpleNamespace(setups=setups, dt=DT, staleness=staleness, flight=flight)
     return Mailbox(init)
 

@@ -35,7 +35,7 @@ from tests.helpers.recordings import completed
 from tests.helpers.recordings import simulated as recording
 from tests.oracles.batch import small_errors
 
-NAMES = sorted({*registry.zoo()} & {*registry.available_names(planar=False)})
+NAMES = sorted({*registry.zoo()} & {*registry.available_names()})
 
 
 class Probe:

@@ -70,7 +70,11 @@ def put(key: str, value: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
         ("setups.0.landmarks", 99, "cannot reshape|not as many names"),
         ("setups.0.target_names", ["a"] * 8, "two targets have the same name"),
         ("setups.0.target_names.0", "a b", "is no name"),
-        ("setups.0.planar", True, "setups.1: other names, landmarks or plane"),
+        (
+            "setups.1.planar",
+            True,
+            "recorded with an earlier version: robots on a plane .*; convert the data set again$",
+        ),
         ("setups.2.gains.k", 0.5, "setups.2.gains.k: 0.5 is not in 0.5"),
         ("setups.2.gains.q", [1.0], "setups.2.gains.q: not 8 positive numbers"),
         ("setups.2.noise.odometry_period", 0.0, "odometry_period: 0.0 is not in"),

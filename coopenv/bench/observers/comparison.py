@@ -20,7 +20,7 @@ from coopenv.bench.observers.judge import JudgedRun, Task, judge_all
 from coopenv.bench.observers.rows import EDGES, Leaderboard, checked_edges
 from coopenv.bench.observers.sources import ALL, RecordSource, find_source, variants_of, with_sensor_sets
 from coopenv.observers.contract import Factory
-from coopenv.observers.registry import available_names, find, list_observers, named, obstacle, portable
+from coopenv.observers.registry import find, list_observers, named, obstacle, portable
 from coopenv.report.notebook import one_line, picture_html, terminal_html
 from coopenv.report.table import Table
 from coopenv.report.tabular import Tabular, written
@@ -236,16 +236,14 @@ class Plan:
         windows: Sequence[float] | str | None = None,
     ) -> Plan:
         """Return a checked plan for a source; the other arguments, and errors, as for `compare`."""
-        names, chosen = _observers(observers, source), variants_of(source, variants)
+        names, chosen = _observers(observers), variants_of(source, variants)
         given = seeds if isinstance(seeds, Iterable) else range(checked_seed(SEEDS if seeds is None else seeds))
         numbers = tuple(dict.fromkeys(map(checked_seed, given)))
         if not numbers:
             raise CoopenvError("seeds: expected at least one")
         if seeds is not None and not source.seeded and numbers != (0,):
             warnings.warn(DataWarning(f"{source.name}: one recording, in which seeds draw nothing"), stacklevel=2)
-        edges = (
-            checked_edges(windows) if windows is not None else EDGES if source.windowed and not source.planar else ()
-        )
+        edges = checked_edges(windows) if windows is not None else EDGES if source.windowed else ()
         obstacles = {} if observers is not None else {name: obstacle(name) for name in list_observers()}
         if ALL in ([variants] if isinstance(variants, str) else variants or ()):
             obstacles |= {name: source.obstacle(name) for name in source.variants}
@@ -302,10 +300,10 @@ class Plan:
         )
 
 
-def _observers(observers: Iterable[str | Factory] | None, source: RecordSource) -> tuple[str, ...]:
-    """Return the names of observers, each once; None: of all that are meant for the vehicles of a source."""
+def _observers(observers: Iterable[str | Factory] | None) -> tuple[str, ...]:
+    """Return the names of observers, each once; None: of all that can be used here."""
     if observers is None:
-        return tuple(name for name in available_names(source.planar) if name in list_observers())
+        return tuple(name for name in list_observers() if not obstacle(name))
     given = list(dict.fromkeys(names_of(observers)))
     if not given:
         raise CoopenvError("observers: expected at least one name or class")

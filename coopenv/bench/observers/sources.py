@@ -61,7 +61,7 @@ class RecordSource(ABC):
     recorded: ClassVar[bool] = True
     """True if all of its records are the same recording."""
     windowed: ClassVar[bool] = True
-    """Judge windows of time from the start on by default; robots on a plane have none."""
+    """Judge windows of time from the start on by default."""
 
     @property
     def variants(self) -> dict[str, str]:
@@ -85,12 +85,6 @@ class RecordSource(ABC):
     @abstractmethod
     def recording(self, variant: str, seed: int) -> Recording:
         """Return a record with the faults of a variant."""
-
-    @property
-    def planar(self) -> bool:
-        """True if the vehicles are robots on a plane; observers suit either these or vehicles in space."""
-        world = self.world()
-        return isinstance(world, Recording) and all(setup.planar for setup in world.setups)
 
     def obstacle(self, variant: str) -> str:
         """Return why it cannot have one of the variants; empty where it can."""

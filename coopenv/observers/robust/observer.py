@@ -24,7 +24,6 @@ from coopenv.measurements.sensor import functions_of
 from coopenv.measurements.table import KINDS
 from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import KernelObserver
-from coopenv.observers.registry import observer_of_robots
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import (
     between,
@@ -449,14 +448,5 @@ WITH_READINGS = replace(ROBUST, name="robust_with_readings", memory=RobustMemory
 
 
 def robust(setup: Setup) -> Observer:
-    """This project's observer for vehicles in space: several hypotheses, gates.
-
-    Raises:
-        CoopenvError: the vehicle moves on a plane and its odometry is its commands.
-    """
-    if setup.planar:
-        raise CoopenvError(
-            f"observer 'robust' is for vehicles in space; '{setup.name}' is a recorded robot on a plane whose odometry "
-            f"is its commands: use '{observer_of_robots()}'"
-        )
+    """This project's observer for vehicles in space: several hypotheses, gates."""
     return KernelObserver(ROBUST, setup)

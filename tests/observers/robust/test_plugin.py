@@ -10,12 +10,9 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers.convergence import random_start
 from coopenv.bench.observers.faults import VARIANTS
 from coopenv.observers import run
-from coopenv.observers.kernel_observer import KernelObserver
-from coopenv.observers.registry import find
 from coopenv.observers.robust.constants import RISK
 from coopenv.observers.robust.integrity import QUANTILE, fault_variances, levels, own_variances
 from tests.helpers.recordings import completed
@@ -78,13 +75,6 @@ def test_a_lost_vehicle_sends_nothing_and_finds_its_place_again():
     assert said[-1] and not all(said)
     assert result.position_error[-1, 0] < 0.1
     assert (result.position_error[-1] < 0.6).all()
-
-
-def test_robots_on_a_plane_are_pointed_to_their_observer():
-    setup = small_errors(12.0).setups[0]
-    assert isinstance(find("robust")(setup), KernelObserver)
-    with pytest.raises(CoopenvError, match=r"'robust' is for vehicles in space.* use 'self_calibrating'"):
-        find("robust")(replace(setup, planar=True))
 
 
 def test_messages_in_cycles_make_no_vehicle_overconfident():
