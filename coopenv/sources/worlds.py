@@ -394,7 +394,8 @@ class Replay(TickGenerator):
 
     def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> ReplayWorld:
         """Return worlds that go through the recording."""
-        observer = find_embedded(self.scenario.observer.name) or HOST
+        host = self.recording.on_a_plane  # a scenario cannot say all that the setups of robots do
+        observer = HOST if host else find_embedded(self.scenario.observer.name) or HOST
         covariance = self.recording.start_covariance
         return ReplayWorld(self.recording, self.scenario, worlds, dtype, device, threads, observer, covariance)
 
