@@ -64,7 +64,7 @@ def test_list_of_observers_and_agents(capsys: pytest.CaptureFixture[str]) -> Non
     assert [line.split()[0] for line in lines if not line.startswith(" ")] == list_observers()
     assert max(map(len, lines)) <= 80
     words = " ".join(" ".join(lines).split())  # wrapped, not cut
-    assert words.count("Calibrates its odometry online; fuses neighbours by split") == 1
+    assert words.count("estimates lasting errors of odometry and sensors, and that corrects neighbours") == 1
     assert main(["list", "agents"]) == 0
     lines = capsys.readouterr().out.splitlines()[2:]
     assert [line.split()[0] for line in lines if not line.startswith(" ")] == list_agents()

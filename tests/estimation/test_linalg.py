@@ -295,5 +295,5 @@ def test_one_process_compiles_and_none_waits_for_cached_code(tmp_path: Path, mon
 
 
 def test_functions_run_as_python_where_compilation_is_off() -> None:
-    show = "from coopenv.observers.frame import across; print(across(0.0, 0.0, 1.0)[0])"
+    show = "from coopenv.observers.linearisation import across; print(across(0.0, 0.0, 1.0)[0])"
     assert output(show, NUMBA_DISABLE_JIT="1") == ["[", "1.", "-0.", "-0.]"]
