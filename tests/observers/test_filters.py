@@ -240,10 +240,10 @@ def test_covariance_intersection_of_one_bearing_is_the_best_of_all_weights() -> 
     fused = CovarianceIntersection(made.setups[1])
     fused.reset(pose(3), P)
     z, noise = np.array([[4.0, 3.0, 2.0]]), replace(made.setups[1].noise, bearing=0.01)
-    heard = replace(made.tick(1, 1, {}), noise=noise)
-    d = (z - fused.state.p) @ fused.state.R - heard.lever_arm
+    tick = replace(made.tick(1, 1, {}), noise=noise)
+    d = (z - fused.state.p) @ fused.state.R - tick.lever_arm
     b = d / np.linalg.norm(d)
-    frame = frame_of_bearings(heard.lever_arm, b, z, 1e-4, C)
+    frame = frame_of_bearings(tick.lever_arm, b, z, 1e-4, C)
     _, (H,), _, (by_target,), *_ = linearise(fused.state.R, fused.state.p, False, frame)
     G = by_target[:, 3:]
 
@@ -251,7 +251,7 @@ def test_covariance_intersection_of_one_bearing_is_the_best_of_all_weights() -> 
         N = 1e-4 * np.eye(2) + G @ C @ G.T / (1 - w)
         return -np.linalg.slogdet(w * np.linalg.inv(P) + H.T @ np.linalg.inv(N) @ H)[1]
 
-    fused.fuse_neighbour(UsableMeasurements(*frame, np.array([None]), heard))
+    fused.fuse_neighbour(UsableMeasurements(*frame, np.array([None]), tick))
     best = min(log_determinant(w) for w in np.linspace(0.001, 0.999, 999))
     assert_allclose(np.linalg.slogdet(fused.state.P)[1], best, atol=0.02)
     assert best < np.linalg.slogdet(P)[1] - 0.05
