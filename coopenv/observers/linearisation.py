@@ -236,6 +236,19 @@ def completed(
     return N, angle
 
 
+@compiled(MATRIX, VECTOR, FLAG, FRAME, TARGET, BLOCKS, BLOCKS, TARGET, types.Array(types.boolean, 2, "C"))
+def call_own_kinds(
+    R: Array, p: Array, right: bool, frame: Any, residual: Array, H: Array, by_target: Array, variance: Array, used: Any
+) -> None:
+    """Call `put_own_kinds`.
+
+    Numba keeps a function that calls Python together with all compiled functions that it names, and compiles these
+    again in every process: so this one names none.
+    """
+    with objmode():
+        put_own_kinds(R, p, right, frame, residual, H, by_target, variance, used)
+
+
 @compiled(MATRIX, VECTOR, FLAG, FRAME)
 def linearise(
     R: Array, p: Array, right: bool, frame: Frame
@@ -264,22 +277,13 @@ def linearise(
             for i in range(3 if target >= 0 else 0):
                 by_target[n, k, i + 3] = axes[i, 0] * J[n, k, 0] + axes[i, 1] * J[n, k, 1] + axes[i, 2] * J[n, k, 2]
     if own != 0:
-        with objmode():
-            put_own_kinds(R, p, right, frame, residual, H, by_target, variance, used)
+        call_own_kinds(R, p, right, frame, residual, H, by_target, variance, used)
     N, angle = completed(residual, H, by_target, variance, used, frame)
     return residual, H, N, by_target, variance, used, angle, ahead
 
 
 def put_own_kinds(
-    R: Array,
-    p: Array,
-    right: bool,
-    frame: Frame,
-    residual: Array,
-    H: Array,
-    by_target: Array,
-    variance: Array,
-    used: NDArray[np.bool_],
+    R: Array, p: Array, right: bool, frame: Any, residual: Array, H: Array, by_target: Array, variance: Array, used: Any
 ) -> None:
     """Write the measurements of kinds that are not compiled; arguments as for `LinearMeasurements`."""
     entries, sensors, _, own = frame

@@ -25,14 +25,7 @@ from coopenv.world.camera import behind_building, inverse_square_of, marker_posi
 from coopenv.world.embedded import Nothing
 from coopenv.world.launch import module_kernels
 from coopenv.world.model import BLIND, IDEAL, Precision, model_struct
-from coopenv.world.random import (
-    SENSOR,
-    STREAMS_PER_SENSOR,
-    gaussian_pair,
-    pair,
-    random_words,
-    uniform,
-)
+from coopenv.world.random import SENSOR, STREAMS_PER_SENSOR, gaussian_pair, pair, random_words, uniform
 from coopenv.world.sensor_information import clear_information, inform_of
 from coopenv.world.state import array, state_struct
 from coopenv.world.step import is_active
@@ -338,16 +331,7 @@ def sensor_kernel(name: str, functions: WarpFunctions | None, p: Precision) -> w
     Drawn = drawn_struct(p) if functions is None else Nothing
     sense_with = _sensing(write_noise if functions is None else _value_writer(functions))
 
-    def measure(
-        model: Model,
-        state: State,
-        drawn: Drawn,
-        hold: Hold,
-        sensor: int,
-        begins: int,
-        first: int,
-        lanes: int,
-    ):
+    def measure(model: Model, state: State, drawn: Drawn, hold: Hold, sensor: int, begins: int, first: int, lanes: int):
         """Take the measurements of the next tick, or with `begins` those of tick 0 in the worlds of a mask.
 
         One thread per world and lane.
