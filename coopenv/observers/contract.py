@@ -58,6 +58,10 @@ class SensorNoise:
     velocity_by_speed: float = 0.0  # m/s per m/s
     angular_velocity_by: tuple[float, float] = (0.0, 0.0)  # rad/s per m/s, and rad/s per rad/s
     """Additional noise of a moving vehicle's odometry samples, proportional to its motion."""
+    latency: float = 0.0
+    """From here on errors of the camera: by how much frames are older than stated, s, a constant of the vehicle."""
+    latency_jitter: float = 0.0  # s, likewise, drawn for every frame
+    camera_orientation_walk: float = 0.0  # rad per axis per square root of a second, of the camera's mounting
 
     def moving(self, velocity: Array, angular_velocity: Array) -> "SensorNoise":
         """Return the noise of a sample at a velocity (3,) in m/s and an angular velocity (3,) in rad/s."""
@@ -131,6 +135,9 @@ class Setup:
     sensors: tuple[Sensor, ...] = ()  # beside the camera
     landmark_rotation: Array | None = None
     """(L, 3, 3) of the landmarks on the map, NaN for those that move; None: no sensor measures an orientation."""
+    landmark_std: Array | None = None
+    """(L,) accuracy of the map: standard deviations of the landmarks' positions per axis, m, the same error for all
+    vehicles; None: exact."""
 
 
 @dataclass(frozen=True)
@@ -206,6 +213,7 @@ class Tick:
     readings: tuple[Reading, ...] = ()  # of the sensors beside the camera, in the order of `Setup.sensors`
     landmark_rotation: Array | None = None  # as in `Setup`
     landmark_names: tuple[str, ...] = ()  # (L,) of the landmarks, or empty
+    bearing_age: float = 0.0  # s since the frame was exposed
 
     @cached_property
     def landmarks_by_name(self) -> Landmarks:
