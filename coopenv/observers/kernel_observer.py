@@ -64,6 +64,8 @@ def model_of(setup: Setup, p: Precision) -> Any:
     noise.slip_rate, noise.slip_duration, noise.slip_size, noise.slip_angle = known.slip
     camera.orientation_std, camera.position_std = known.camera_orientation, known.camera_position
     camera.focal_std = known.focal_length
+    camera.latency_std, camera.latency_jitter = known.latency, known.latency_jitter
+    camera.orientation_walk = known.camera_orientation_walk
     fault = entry_struct(p, "fault")()
     fault.clock = known.clock_offset
     for name, entry in (("fault", fault), ("camera", camera), ("noise", noise)):
@@ -72,6 +74,8 @@ def model_of(setup: Setup, p: Precision) -> Any:
     markers = np.zeros((T, 3))
     markers[L + setup.vehicle] = setup.marker
     model.scene.marker = wp.array(markers, dtype=p.vec3, device="cpu")
+    landmark_std = np.zeros(L) if setup.landmark_std is None else setup.landmark_std
+    model.scene.landmark_std = wp.array(landmark_std, dtype=p.scalar, device="cpu")
     model.radio.period = model.radio.slots = 1
     model.radio.range = model.radio.staleness = math.inf
     gains = setup.gains
@@ -203,6 +207,7 @@ class KernelObserver:
         s.increment_rotation[...], s.increment_translation[...] = tick.rotation, tick.translation
         s.odometry_velocity[...], s.odometry_angular_velocity[...] = tick.velocity, tick.angular_velocity
         s.position[: self.setup.landmarks] = tick.landmarks
+        s.bearing_age[...] = tick.bearing_age
         s.sight[tick.targets] = np.where(tick.valid, _VISIBLE, _OUT_OF_VIEW)
         seen = tick.targets[tick.valid]
         s.bearing[seen], s.bearing_tick[seen] = tick.bearings[tick.valid] @ self._camera, now

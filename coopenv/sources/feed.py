@@ -60,6 +60,7 @@ def forget_errors(state: Any, world: int, vehicle: int):
     state.camera_turn[world, vehicle] = unknown
     state.camera_shift[world, vehicle] = unknown
     state.camera_focal[world, vehicle] = unknown[0]
+    state.camera_delay[world, vehicle] = unknown[0]
 
 
 @wp.func
@@ -112,6 +113,7 @@ def recall(model: Any, state: Any, record: Any, world: int, tick: int):
         state.odometry_angular_velocity[world, vehicle] = record.angular_velocity[row, vehicle]
         state.odometry_samples[world, vehicle] = record.samples[row, vehicle]
         state.pan[world, vehicle] = record.pan[row, vehicle]
+        state.bearing_age[world, vehicle] = record.bearing_age[row, vehicle]
         to_camera = wp.transpose(model.camera[vehicle].rotation)
         for target in range(model.agents):
             state.sight[world, vehicle, target] = NOT_A_NEIGHBOUR
@@ -199,7 +201,8 @@ def record_struct(p: Precision) -> Any:
         angular_velocity: array("KN", vec3)  # rad/s
         samples: array("KN", wp.int32)  # odometry samples so far
         bearings: array("KNT", vec3)  # body frame
-        bearing_lag: array("KN", wp.int32)  # ticks since the frame was exposed
+        bearing_age: array("KN", p.scalar)  # s since the frame was exposed
+        bearing_lag: array("KN", wp.int32)  # likewise, ticks
         visible: array("KNT", wp.uint8)
         pan: array("KN", p.scalar)  # rad
         reading: array("KNRT", p.vec6)  # of sensors beside the camera; NaN: not measured

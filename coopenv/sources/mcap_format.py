@@ -38,6 +38,7 @@ EXACT = {
     "v2x": "coopenv_msgs/msg/Inbox",
     "truth_exact": "coopenv_msgs/msg/Truth",
     "pan": "coopenv_msgs/msg/Pan",
+    "bearing_age": "coopenv_msgs/msg/Age",
 }
 """Topics of a vehicle that hold the recording, one message a tick."""
 
@@ -45,6 +46,7 @@ CONTENTS = {
     "increment": {name: name for name in ("rotation", "translation", "velocity", "angular_velocity")},
     "bearings": {},
     "pan": {"angle": "pan"},
+    "bearing_age": {"age": "bearing_age"},
     "v2x": {"tick_sent": "inbox_tick"},
     "truth_exact": {"rotation": "truth.rotation", "position": "truth.position"},
 }
@@ -121,6 +123,7 @@ SetupHeader = create_model(
         gains=_section_of(Gains, q=tuple[Number, ...]),
         sensors=tuple[SensorHeader, ...],  # type: ignore[valid-type]
         landmark_rotation=tuple[tuple[Row3, Row3, Row3], ...] | None,
+        landmark_std=tuple[Number, ...] | None,
     ),
     planar=(bool, False),  # earlier versions wrote it: true of robots on a plane whose odometry is their commands
 )
@@ -163,8 +166,9 @@ class RecordingHeader(Section):
 def header_of(recording: Recording) -> bytes:
     """Return the header of a recording as JSON."""
     values = jsonable({name: getattr(recording, name) for name in RecordingHeader.model_fields})
-    for setup in values["setups"] if not recording.readings else ():
-        for name in ONLY_WITH_SENSORS:
+    unused = () if recording.readings else ONLY_WITH_SENSORS
+    for setup in values["setups"]:
+        for name in (*unused, *(["landmark_std"] if setup["landmark_std"] is None else [])):
             del setup[name]
     for setup in values["setups"] if recording.readings else ():
         for sensor in setup["sensors"]:
@@ -197,6 +201,7 @@ def _setup(header: Any) -> Setup:
         "gains": Gains(**{**dict(header.gains), "q": np.array(header.gains.q)}),
         "sensors": tuple(_sensor(sensor) for sensor in header.sensors),
         "landmark_rotation": header.landmark_rotation and np.array(header.landmark_rotation, float),
+        "landmark_std": header.landmark_std and np.array(header.landmark_std, float),
     }
     values = {**dict(header), **arrays}
     if values.pop("planar"):

@@ -13,7 +13,7 @@ import warp as wp
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Coordinates
 from coopenv.estimation.validity import Rule
-from coopenv.world.camera import observe
+from coopenv.world.camera import draw_map, observe
 from coopenv.world.dynamics import move, move_landmarks
 from coopenv.world.model import Precision
 from coopenv.world.nearby import sort_into_cells
@@ -183,8 +183,9 @@ def sense_vehicle(model: Any, state: Any, world: int, vehicle: int, tick: int):
 
 @device_function
 def begin_sensing(model: Any, state: Any, world: int):
-    """Draw initial estimates and lasting errors, look for contact, take the first frame."""
+    """Draw errors of maps, initial estimates and lasting errors, look for contact, take the first frame."""
     sort_into_cells(model, state, world)
+    draw_map(model, state, world)
     for vehicle in range(model.vehicles):
         set_initial_estimate(model, state, world, vehicle)
         draw_errors(model, state, world, vehicle)

@@ -149,6 +149,7 @@ def model_struct(p: Precision) -> Any:
         body_center: wp.array(dtype=vec3)  # (A,) body frame, m
         marker: wp.array(dtype=vec3)  # (A,) body frame, m
         anchor: wp.array(dtype=wp.int32)  # (A,) 1: cameras do not see it
+        landmark_std: wp.array(dtype=scalar)  # (L,) m, per axis, of its position on the map
         obstacle_rotation: wp.array(dtype=mat33)  # (O,)
         obstacle_center: wp.array(dtype=vec3)  # (O,) m
         obstacle_half: wp.array(dtype=vec3)  # (O,) m
@@ -239,6 +240,12 @@ def model_struct(p: Precision) -> Any:
         orientation_std: scalar  # rad, per axis, of the error of `rotation`
         position_std: scalar  # m, per axis, of the error of `position`
         focal_std: scalar  # of the error of `focal_length`, relative
+        changes: wp.int32  # 1: any of the following is on
+        orientation_walk: scalar  # rad per sqrt s, per axis, of the error of `rotation`
+        latency: scalar  # s, age of a frame as the vehicle knows it
+        latency_std: scalar  # s, of the error of `latency`
+        latency_jitter: scalar  # s, of a further error of every frame
+        latency_ticks: wp.int32  # nearest to `latency`
 
     @wp.struct
     class NoiseValues:
@@ -248,6 +255,9 @@ def model_struct(p: Precision) -> Any:
         angular_velocity: scalar  # rad/s
         bearing_paper: wp.int32
         bearing: scalar
+        bearing_correlated: scalar  # rad, standard deviation of a Gauss-Markov process
+        bearing_correlation_time: scalar  # s, of that
+        bearing_counted: scalar  # rad, standard deviation of white noise by which filters count that
         axis: mat33  # columns: image-plane axes and optical axis of the paper's formula, camera frame
         lasting: wp.int32  # 1: any of the errors below is on
         odometry_scale: scalar
@@ -415,6 +425,7 @@ def model_struct(p: Precision) -> Any:
         restarts: wp.int32  # 1: some vehicle may restart
         alters: wp.int32  # 1: some broadcast pose may differ from its sender's estimate
         map_errors: wp.int32  # 1: a landmark may be off on some map
+        correlated: wp.int32  # 1: some vehicle's bearings have a correlated error
         jammers: wp.int32  # 1: some vehicle may carry a jammer
         radio: Radio
         observer: ObserverValues
