@@ -63,9 +63,9 @@ def model_of(setup: Setup, p: Precision) -> Any:
     noise.gyro_bias, noise.gyro_bias_walk = p.vec3(*known.gyro_bias), p.vec3(*known.gyro_bias_walk)
     noise.slip_rate, noise.slip_duration, noise.slip_size, noise.slip_angle = known.slip
     camera.orientation_std, camera.position_std = known.camera_orientation, known.camera_position
-    camera.focal_std = known.focal_length
+    camera.focal_std, camera.orientation_walk = known.focal_length, known.camera_orientation_walk
     camera.latency_std, camera.latency_jitter = known.latency, known.latency_jitter
-    camera.orientation_walk = known.camera_orientation_walk
+    model.landmark_std = wp.array(setup.landmark_std or np.zeros(L), dtype=p.scalar, device="cpu")
     fault = entry_struct(p, "fault")()
     fault.clock = known.clock_offset
     for name, entry in (("fault", fault), ("camera", camera), ("noise", noise)):
@@ -74,8 +74,6 @@ def model_of(setup: Setup, p: Precision) -> Any:
     markers = np.zeros((T, 3))
     markers[L + setup.vehicle] = setup.marker
     model.scene.marker = wp.array(markers, dtype=p.vec3, device="cpu")
-    landmark_std = np.zeros(L) if setup.landmark_std is None else setup.landmark_std
-    model.scene.landmark_std = wp.array(landmark_std, dtype=p.scalar, device="cpu")
     model.radio.period = model.radio.slots = 1
     model.radio.range = model.radio.staleness = math.inf
     gains = setup.gains

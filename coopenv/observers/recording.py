@@ -369,8 +369,8 @@ def _check_setup(setup: Setup, vehicle: int, first: Setup, where: str) -> None:
         positive = _is_array(getattr(gains, name), (count,)) and np.min(getattr(gains, name)) > 0.0
         _require(positive, f"{where}.gains.{name}: not {count} positive numbers")
     std = setup.landmark_std
-    valid = std is None or (_is_array(std, (setup.landmarks,)) and np.min(std, initial=0.0) >= 0.0)
-    _require(valid, f"{where}.landmark_std: not {setup.landmarks} numbers of at least 0")
+    valid = len(std) in (0, setup.landmarks) and min(std, default=0.0) >= 0.0 and max(std, default=0.0) <= LARGEST
+    _require(valid, f"{where}.landmark_std: not {setup.landmarks} numbers in 0 .. {LARGEST:g}")
     for problem in problems_of_sensors(setup, first):
         raise DataError(f"{where}.sensors.{problem}")
 

@@ -224,11 +224,11 @@ class Scenario(Section, metaclass=_Loaded):
         return any(n.enabled and (n.lasts or c.is_misplaced) for n, c in zip(noises, cameras, strict=True))
 
     @property
-    def landmark_std(self) -> np.ndarray | None:
-        """(L,) standard deviations per axis of the landmarks' positions on the map, m; None: exact."""
+    def landmark_std(self) -> tuple[float, ...]:
+        """(L,) standard deviations per axis of the landmarks' positions on the map, m; empty: exact."""
         common = self.map.accuracy
-        std = np.array([common if mark.accuracy is None else mark.accuracy for mark in self.landmarks], float)
-        return std if self.noise.enabled and std.any() else None
+        std = tuple(common if mark.accuracy is None else mark.accuracy for mark in self.landmarks)
+        return std if self.noise.enabled and any(std) else ()
 
     @property
     def cameras(self) -> list[Camera]:

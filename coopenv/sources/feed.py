@@ -17,7 +17,7 @@ from coopenv.observers.sensed import MEASURED, Sensed, Truth
 from coopenv.scenario import Scenario
 from coopenv.scenario.difficulty import PARAMETERS
 from coopenv.world.camera import MISSED, OUT_OF_VIEW, VISIBLE, camera_to_body, marker_position, sight_of
-from coopenv.world.dynamics import move
+from coopenv.world.dynamics import move, remember
 from coopenv.world.embedded import Source, arrange_world, begin_sensing, look_around, sense_nothing
 from coopenv.world.model import Precision
 from coopenv.world.nearby import NOT_A_NEIGHBOUR, sort_into_cells
@@ -177,6 +177,7 @@ def rewind(model: Any, state: Any, record: Any, world: int):
             state.estimate_rotation[world, vehicle] = R
             state.estimate_position[world, vehicle] = wp.transpose(R) * record.start_position[vehicle]
     recall(model, state, record, world, 0)
+    remember(model, state, world, 0)
     for vehicle in range(model.vehicles):
         state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
 

@@ -123,12 +123,14 @@ SetupHeader = create_model(
         gains=_section_of(Gains, q=tuple[Number, ...]),
         sensors=tuple[SensorHeader, ...],  # type: ignore[valid-type]
         landmark_rotation=tuple[tuple[Row3, Row3, Row3], ...] | None,
-        landmark_std=tuple[Number, ...] | None,
     ),
     planar=(bool, False),  # earlier versions wrote it: true of robots on a plane whose odometry is their commands
 )
-ONLY_WITH_SENSORS = ("sensors", "landmark_rotation")
-"""Entries of a setup that the header of a recording without sensors beside cameras does not have."""
+OPTIONAL: dict[type, dict[str, Any]] = {
+    of: {field.name: field.default for field in fields(of) if field.default in ((), None, 0.0)}
+    for of in (Setup, SensorNoise)
+}
+"""Entries that a header has only if they are not empty; versions without them read the others' headers."""
 
 
 class RecordingHeader(Section):
@@ -166,18 +168,22 @@ class RecordingHeader(Section):
 def header_of(recording: Recording) -> bytes:
     """Return the header of a recording as JSON."""
     values = jsonable({name: getattr(recording, name) for name in RecordingHeader.model_fields})
-    unused = () if recording.readings else ONLY_WITH_SENSORS
     for setup in values["setups"]:
-        for name in (*unused, *(["landmark_std"] if setup["landmark_std"] is None else [])):
-            del setup[name]
-    for setup in values["setups"] if recording.readings else ():
-        for sensor in setup["sensors"]:
+        setup["noise"] = _without_empty(SensorNoise, setup["noise"])
+    values["setups"] = [_without_empty(Setup, setup) for setup in values["setups"]]
+    for setup in values["setups"]:
+        for sensor in setup.get("sensors", ()):
             sensor["reference"] = name_in_logs(sensor["reference"])
     if values["scenario"] is not None:
         values["scenario"] = without_own_terms(values["scenario"])
         for sensor in values["scenario"].get("sensors", ()):
             sensor["kind"] = name_in_logs(sensor["kind"])
     return json.dumps(values, separators=(",", ":")).encode()
+
+
+def _without_empty(of: type, entries: dict[str, Any]) -> dict[str, Any]:
+    empty = OPTIONAL[of]
+    return {name: value for name, value in entries.items() if name not in empty or value != jsonable(empty[name])}
 
 
 def _scenario_of(raw: Mapping[str, Any], where: str) -> Scenario:
@@ -201,7 +207,6 @@ def _setup(header: Any) -> Setup:
         "gains": Gains(**{**dict(header.gains), "q": np.array(header.gains.q)}),
         "sensors": tuple(_sensor(sensor) for sensor in header.sensors),
         "landmark_rotation": header.landmark_rotation and np.array(header.landmark_rotation, float),
-        "landmark_std": header.landmark_std and np.array(header.landmark_std, float),
     }
     values = {**dict(header), **arrays}
     if values.pop("planar"):

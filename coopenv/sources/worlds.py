@@ -203,14 +203,14 @@ def _of_robots(recording: Recording, name: str) -> dict[str, Any]:
         raise DataError(f"{name}: its corrections are not due at a fixed rate")
     staleness = recording.staleness if math.isfinite(recording.staleness) else None
     points = zip(targets[: first.landmarks], recording.landmarks[0].tolist(), strict=True)
-    accuracies = np.zeros(first.landmarks) if first.landmark_std is None else first.landmark_std
+    accuracies = first.landmark_std or [None] * first.landmarks
     starts = zip(recording.setups, recording.start_position.tolist(), strict=True)
     return {
         "title": name,
         "horizon": (recording.ticks - 1) * recording.dt,
         "landmarks": [
             {"name": target, "position": position, "accuracy": std}
-            for (target, position), std in zip(points, accuracies.tolist(), strict=True)
+            for (target, position), std in zip(points, accuracies, strict=True)
         ],
         "vehicles": [
             {

@@ -292,13 +292,25 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "target_count": [len(targets) for targets in sets],
         "order": order,
         "rank": np.argsort(order),
+        "landmark_std": scenario.landmark_std or np.zeros(len(scenario.landmarks)),
         "clocks": any(f.clock_offset > 0.0 for f in faults),
         "restarts": any(f.restart.chance > 0.0 for f in faults),
         "alters": any(f.alters for f in faults),
-        "map_errors": scenario.landmark_std is not None or any(f.map_error.chance > 0.0 for f in faults),
+        "map_errors": len(scenario.landmark_std) > 0 or any(f.map_error.chance > 0.0 for f in faults),
+        "past": _kept_ticks(scenario),
         "correlated": any(n.enabled and n.bearing.correlated.std > 0.0 for n in scenario.noises),
         "jammers": any(f.jammer.chance > 0.0 for f in faults),
     }
+
+
+FARTHEST_DRAW = 5.0  # standard deviations, which one frame in two millions exceeds
+
+
+def _kept_ticks(scenario: Scenario) -> int:
+    """Return the number of ticks of which the poses of all agents are kept for frames that show the past."""
+    late = [camera for camera in scenario.cameras if camera.is_late]
+    ages = [c.latency + FARTHEST_DRAW * math.hypot(c.latency_error, c.latency_jitter) for c in late]
+    return 1 + math.ceil(max(ages) * scenario.rates.camera) if ages else 0
 
 
 def _start(scenario: Scenario) -> dict[str, Any]:
@@ -381,7 +393,6 @@ def _scene(scenario: Scenario) -> dict[str, Any]:
         "body_center": [body.center if body else NOWHERE for body in bodies],
         "marker": [agent.marker for agent in everyone],
         "anchor": [*(mark.anchor for mark in scenario.landmarks), *(False for _ in scenario.vehicles)],
-        "landmark_std": np.zeros(len(scenario.landmarks)) if scenario.landmark_std is None else scenario.landmark_std,
         "obstacle_rotation": [rotation_of(obstacle.yaw, None) for obstacle in scenario.obstacles],
         "obstacle_center": [np.array(obstacle.center) - origin for obstacle in scenario.obstacles],
         "obstacle_half": [np.array(obstacle.size) / 2 for obstacle in scenario.obstacles],

@@ -9,7 +9,8 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation import Sight
-from coopenv.estimation.linalg import exp_so3, rigid_motion
+from coopenv.estimation.linalg import exp_so3
+from coopenv.world.dynamics import pose_before
 from coopenv.world.model import BLIND, IDEAL
 from coopenv.world.nearby import (
     agent_of,
@@ -56,24 +57,12 @@ def marker_position(model: Any, state: Any, world: int, agent: int):
 
 
 @device_function
-def pose_before(state: Any, world: int, agent: int, age: Any):
-    """Return the pose of an agent some time ago, s, by its present twist: exact while that is constant."""
-    R = state.rotation[world, agent]
-    position = state.position[world, agent]
-    if age != type(age)(0.0):
-        turn, way = rigid_motion(-age * state.angular_velocity[world, agent], -age * state.velocity[world, agent])
-        position = position + R * way
-        R = R * turn
-    return R, position
-
-
-@device_function
 def draw_map(model: Any, state: Any, world: int):
     """Draw the errors of the landmarks' positions on all maps by the map's accuracy."""
     for landmark in range(wp.where(model.map_errors == 1, model.landmarks, 0)):
         words = random_words(state.seed[world], state.episode[world], 0, landmark, MAP_ACCURACY)
         drawn, _ = four_gaussians(words, state.position[world, landmark])
-        state.map_offset[world, landmark] = model.scene.landmark_std[landmark] * drawn
+        state.map_offset[world, landmark] = model.landmark_std[landmark] * drawn
 
 
 @wp.func
@@ -363,7 +352,7 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
     if camera.changes == 1:
         age = expose(model, state, world, vehicle, tick)
         exposed = wp.max(tick - camera.latency_ticks, 0)
-    R, position = pose_before(state, world, agent, age)
+    R, position = pose_before(model, state, world, agent, tick, age)
     turned = camera_to_body(model, state, world, vehicle)
     to_rest = wp.transpose(camera.rotation) * turned
     if camera.orientation_std > zero or camera.position_std > zero or camera.orientation_walk > zero:
@@ -381,7 +370,7 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
         target = agent_of(state, kept, world, vehicle, entry)
         if kept > 0 and not is_target(model, vehicle, target):
             continue
-        target_R, target_position = pose_before(state, world, target, age)
+        target_R, target_position = pose_before(model, state, world, target, tick, age)
         line = target_position + target_R * model.scene.marker[target] - origin
         ray = to_camera * line
         sight = sight_of(model, state, world, vehicle, target, origin, line, ray)

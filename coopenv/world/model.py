@@ -149,7 +149,6 @@ def model_struct(p: Precision) -> Any:
         body_center: wp.array(dtype=vec3)  # (A,) body frame, m
         marker: wp.array(dtype=vec3)  # (A,) body frame, m
         anchor: wp.array(dtype=wp.int32)  # (A,) 1: cameras do not see it
-        landmark_std: wp.array(dtype=scalar)  # (L,) m, per axis, of its position on the map
         obstacle_rotation: wp.array(dtype=mat33)  # (O,)
         obstacle_center: wp.array(dtype=vec3)  # (O,) m
         obstacle_half: wp.array(dtype=vec3)  # (O,) m
@@ -240,12 +239,12 @@ def model_struct(p: Precision) -> Any:
         orientation_std: scalar  # rad, per axis, of the error of `rotation`
         position_std: scalar  # m, per axis, of the error of `position`
         focal_std: scalar  # of the error of `focal_length`, relative
-        changes: wp.int32  # 1: any of the following is on
-        orientation_walk: scalar  # rad per sqrt s, per axis, of the error of `rotation`
-        latency: scalar  # s, age of a frame as the vehicle knows it
-        latency_std: scalar  # s, of the error of `latency`
-        latency_jitter: scalar  # s, of a further error of every frame
+        orientation_walk: scalar  # rad per root of a second, of the error of `rotation`
+        latency: scalar  # s, known age of a frame
+        latency_std: scalar  # s, of a constant error of `latency`
+        latency_jitter: scalar  # s, of one drawn for every frame
         latency_ticks: wp.int32  # nearest to `latency`
+        changes: wp.int32  # 1: frames have an age, or `rotation` walks
 
     @wp.struct
     class NoiseValues:
@@ -420,11 +419,13 @@ def model_struct(p: Precision) -> Any:
         sensor: wp.array(dtype=SensorValues)  # (R,) beside cameras
         carries: wp.array2d(dtype=wp.int32)  # (N, R) 1: a vehicle has a sensor
         measures: wp.array2d(dtype=wp.int32)  # (R, A) 1: a sensor measures an agent
+        landmark_std: wp.array(dtype=scalar)  # (L,) m, accuracy of their places on the map
         fault: wp.array(dtype=FaultValues)  # (N,)
         clocks: wp.int32  # 1: some clock is off
         restarts: wp.int32  # 1: some vehicle may restart
         alters: wp.int32  # 1: some broadcast pose may differ from its sender's estimate
         map_errors: wp.int32  # 1: a landmark may be off on some map
+        past: wp.int32  # ticks of which poses are kept: as old as frames may be
         correlated: wp.int32  # 1: some vehicle's bearings have a correlated error
         jammers: wp.int32  # 1: some vehicle may carry a jammer
         radio: Radio

@@ -1,12 +1,12 @@
 """The changing side of a world: one record of arrays with leading axes (world, agent or vehicle).
 
-W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders), M odometry samples a tick, S slots of
-the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q parameters, U numbers of an action, Z bodies
-of the traffic, G cells of the grid, I items in it. Measurements and messages have X entries, one per agent, and Y
-boxes, one per sender, or as many as are kept (V), see `coopenv.world.nearby`; E agents that may be off on maps, C
-entries with a correlated error. R
-sensors beside the camera; F measurements of a frame at most, in pairs of rows. L lanes of scratch: indexed by vehicle,
-shared by the vehicles that one thread takes in turn.
+W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders), K ticks of which poses are kept, M
+odometry samples a tick, S slots of the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q
+parameters, U numbers of an action, Z bodies of the traffic, G cells of the grid, I items in it. Measurements and
+messages have X entries, one per agent, and Y boxes, one per sender, or as many as are kept (V), see
+`coopenv.world.nearby`; E agents that may be off on maps, C entries with a correlated error. R sensors beside the
+camera; F measurements of a frame at most, in pairs of rows. L lanes of scratch: indexed by vehicle, shared by the
+vehicles that one thread takes in turn.
 
 A field of a record states its axes once, a letter each, and is allocated by them. It also states the rule of its saved
 values; all rules are checked before anything is restored.
@@ -314,6 +314,10 @@ def state_struct(p: Precision) -> Any:
         position: array("WA", vec3, TRUTH)  # truth, map
         velocity: array("WA", vec3, TRUTH)  # truth, body, m/s
         angular_velocity: array("WA", vec3, TRUTH)  # truth, body, rad/s
+        past_rotation: array("WAK", mat33, ROTATION._replace(of_truth=True))  # the same at a tick k, in slot k % K
+        past_position: array("WAK", vec3, TRUTH)
+        past_velocity: array("WAK", vec3, TRUTH)
+        past_angular_velocity: array("WAK", vec3, TRUTH)
         speed: array("WN", scalar)  # forwards, m/s
         turn: array("WN", scalar, TURN)  # steering angle, rad, or turn rate, rad/s, by the kind of motion
         lateral_speed: array("WN", scalar)  # to the left, m/s
@@ -432,7 +436,7 @@ def state_sizes(model: Any, worlds: int) -> dict[str, int]:
     }
     near["C"] = near["X"] * model.correlated
     grid = {"G": model.cells.across**2, "I": model.agents + model.traffic}
-    ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
+    ticks = {"K": model.past, "M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
     draws = {"P": model.routes.points, "Q": len(PARAMETERS), "Z": model.traffic, "U": model.action_size}
     sensors = 0 if model.sensor is None else model.sensor.shape[0]
     rows = {"R": sensors, "F": near["X"] * (1 + PAIRS_OF_ROWS * sensors)}

@@ -205,12 +205,12 @@ def test_maps_are_off_by_their_accuracy() -> None:
         assert abs(np.mean(off[:, n])) <= 4.0 * std / np.sqrt(3.0 * WORLDS)
     assert abs(np.mean(off[:, 0] * off[:, 2])) < 4.0 * 0.05**2 / np.sqrt(3.0 * WORLDS)
     setups = observer_init_of(made, world.model).setups
-    assert_allclose(setups[2].landmark_std, [0.05, 0.0, 0.05, 0.2])
+    assert setups[2].landmark_std == (0.05, 0.0, 0.05, 0.2)
     known = [world.sensed(1, 0).tick(setup, {}).landmarks for setup in setups]
     assert_array_equal(known[0], known[2])
     world.advance(60)
     assert_allclose(landmarks_known(world) - world.view("position")[:, :4], off, atol=1e-12)
-    assert observer_init_of(scenario(), start(scenario()).model).setups[0].landmark_std is None
+    assert observer_init_of(scenario(), start(scenario()).model).setups[0].landmark_std == ()
 
 
 def test_resets_draw_anew_and_batches_are_single_worlds() -> None:
@@ -243,7 +243,7 @@ def test_recordings_logs_and_replays_keep_the_age_and_the_map(tmp_path: Path) ->
     assert_allclose(read.bearing_age, 0.04)
     for name in ("bearings", "landmarks", "bearing_age"):
         assert_array_equal(getattr(read, name), getattr(recording, name))
-    assert_array_equal(read.setups[1].landmark_std, recording.setups[1].landmark_std)
+    assert read.setups[1].landmark_std == recording.setups[1].landmark_std == (0.05,) * 4
     assert read.setups[1].noise == recording.setups[1].noise
     assert recording.tick(7, 1, {}).bearing_age == 0.04
     replayed, world = Replay(read, "test").world(1, "float64", "cpu", 1), start(made, 3)
@@ -267,7 +267,7 @@ def test_the_switch_of_noise_leaves_the_known_latency_alone() -> None:
         world.advance(10)
     assert same_bits(states[0].view("bearing"), states[1].view("bearing"))
     setup = observer_init_of(made, states[0].model).setups[0]
-    assert setup.landmark_std is None and setup.noise.latency == setup.noise.bearing == 0.0
+    assert setup.landmark_std == () and setup.noise.latency == setup.noise.bearing == 0.0
     assert states[0].sensed(0, 10).tick(setup, {}).bearing_age == 0.03  # type: ignore[attr-defined]
 
 
