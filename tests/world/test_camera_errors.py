@@ -11,10 +11,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from coopenv.base.errors import ScenarioError
+from coopenv.base.errors import ScenarioError, ScenarioWarning
 from coopenv.observers.setups import observer_init_of
 from coopenv.runs import record
-from coopenv.scenario import Scenario
+from coopenv.scenario import Scenario, parse_scenario
 from coopenv.sources.mcap import read_recording, write_recording
 from coopenv.sources.worlds import Replay, SimulatedWorld
 from tests.helpers.builders import (
@@ -269,6 +269,11 @@ def test_the_switch_of_noise_leaves_the_known_latency_alone() -> None:
     setup = observer_init_of(made, states[0].model).setups[0]
     assert setup.landmark_std == () and setup.noise.latency == setup.noise.bearing == 0.0
     assert states[0].sensed(0, 10).tick(setup, {}).bearing_age == 0.03  # type: ignore[attr-defined]
+
+
+def test_observers_that_ignore_them_are_named() -> None:
+    with pytest.warns(ScenarioWarning, match="'riccati' .* ignores camera.latency, map.accuracy"):
+        parse_scenario(raw(circling(), **ALL), "test")
 
 
 @pytest.mark.parametrize(
