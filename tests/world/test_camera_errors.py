@@ -280,6 +280,7 @@ def test_observers_that_ignore_them_are_named() -> None:
     ("sections", "message"),
     [
         ({"camera": {"latency": -0.1}}, "camera.latency"),
+        ({"camera": {"latency": 30.0}}, "camera.latency: .* less than or equal to 5, got 30.*: milliseconds in place"),
         ({"camera": {"latency_std": 0.1}}, "camera.latency_std"),
         ({"noise": {"bearing": {"correlated": {"std": 0.1, "time": 0.0}}}}, "noise.bearing.correlated.time"),
         ({"map": {"accuracy": -1.0}}, "map.accuracy"),
