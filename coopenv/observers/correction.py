@@ -165,6 +165,7 @@ def curvature(G: Array, angle: NDArray[np.bool_], line: Array, V: Array, frames:
     return np.asarray(frames[:, None] * variances / distance**2)
 
 
+RISK = 1e-3  # that a correct measurement is refused
 LARGEST = 13.8155  # 0.999 of a chi-square of 2: -2 log 0.001
 LARGEST_OF = np.array([LARGEST, 10.828, LARGEST, 16.266, 18.467, 20.515, 22.458])
 """The same of as many degrees of freedom; a measurement without any row fits."""
@@ -187,6 +188,7 @@ class InnovationGate:
         self.share = 0.0  # of rejected bearings, averaged
         self.is_open = False
         self.time = 0.0  # s, of the last frame
+        self.weight = 0.0  # in the share, of one bearing of it
 
     def passed(self, time: float, judgement: Judgement) -> NDArray[np.bool_]:
         """Return (m,) which measurements of a frame are accepted; a measurement with an invalid S never is.
@@ -196,13 +198,19 @@ class InnovationGate:
             judgement: of the frame.
         """
         definite, fits, rejected, widest = judgement
-        self.share += (rejected - self.share) * min(1.0, max(0.0, time - self.time) / AVERAGING)
+        weight = min(1.0, max(0.0, time - self.time) / AVERAGING)
+        self.share += (rejected - self.share) * weight
+        self.weight = weight / len(fits)
         if widest > WIDE:
             self.share = 1.0
         self.time = time
         self.is_open = self.share > (CLOSING_SHARE if self.is_open else OPENING_SHARE)
         taken: NDArray[np.bool_] = definite if self.is_open else fits
         return taken
+
+    def refuse(self, count: int) -> None:
+        """Count so many accepted measurements of the last frame as rejected."""
+        self.share += count * self.weight
 
 
 @compiled(MATRIX, MATRICES, FLAG_ROWS, FLAG_ROWS, FLAGS)
