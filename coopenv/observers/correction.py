@@ -21,8 +21,9 @@ bearings would be rejected. Occasional wrong associations do not open it, nor do
 While the gate is open, a faulty message is fused.
 """
 
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
@@ -176,9 +177,19 @@ OPENING_SHARE, CLOSING_SHARE = 0.6, 0.1
 of two does not open the gate; one of three keeps it open."""
 
 
-Judgement = tuple[NDArray[np.bool_], NDArray[np.bool_], float, float]
-"""(m,) which S are covariances, (m,) which measurements fit, the share of the others, and the largest trace, rad^2, of
-the rows that measure an angle."""
+SECOND_ORDER = 0.75
+"""Largest mean square of half the square of a normal error, over its squared variance: that of one axis."""
+
+
+class Judgement(NamedTuple):
+    """How the measurements of a frame are judged at a prediction."""
+
+    definite: NDArray[np.bool_]  # (m,) which S are covariances
+    fits: NDArray[np.bool_]  # (m,) which measurements fit
+    rejected: float  # share of the others
+    widest: float  # largest trace, rad^2, of the rows of S that measure an angle
+    normal: Array  # (m, r) residuals over their standard deviations, second-order errors included; NaN: not measured
+    white: Array  # (m, r) shares of the sensors in the variances
 
 
 class InnovationGate:
@@ -197,7 +208,7 @@ class InnovationGate:
             time: s.
             judgement: of the frame.
         """
-        definite, fits, rejected, widest = judgement
+        definite, fits, rejected, widest = judgement[:4]
         weight = min(1.0, max(0.0, time - self.time) / AVERAGING)
         self.share += (rejected - self.share) * weight
         self.weight = weight / len(fits)
@@ -213,13 +224,19 @@ class InnovationGate:
         self.share += count * self.weight
 
 
-@compiled(MATRIX, MATRICES, FLAG_ROWS, FLAG_ROWS, FLAGS)
+@compiled(MATRIX, MATRICES, MATRIX, FLAG_ROWS, FLAG_ROWS, FLAGS)
 def judged(
-    residual: Array, S: Array, used: NDArray[np.bool_], angle: NDArray[np.bool_], ahead: NDArray[np.bool_]
+    residual: Array,
+    S: Array,
+    variance: Array,
+    used: NDArray[np.bool_],
+    angle: NDArray[np.bool_],
+    ahead: NDArray[np.bool_],
 ) -> Judgement:
     """Return how measurements with covariances S (m, r, r) are judged; arguments as for `LinearMeasurements`."""
     squared, widest = normalised(residual, S), 0.0
     definite, fits = np.empty(len(S), np.bool_), np.empty(len(S), np.bool_)
+    normal, white = np.full(residual.shape, np.nan), np.ones(residual.shape)
     for n in range(len(S)):
         dof, trace = np.count_nonzero(used[n]), 0.0
         for k in range(residual.shape[1]):
@@ -227,7 +244,11 @@ def judged(
         definite[n] = squared[n] >= 0.0 and dof > 0
         fits[n] = definite[n] and squared[n] <= LARGEST_OF[dof] and ahead[n]
         widest = max(widest, trace)
-    return definite, fits, 1.0 - np.count_nonzero(fits) / len(fits), widest
+        for k in range(residual.shape[1]):
+            if used[n, k] and definite[n]:
+                of_row = S[n, k, k] + (SECOND_ORDER * trace * trace if angle[n, k] else 0.0)
+                normal[n, k], white[n, k] = residual[n, k] / math.sqrt(of_row), variance[n, k] / of_row
+    return Judgement(definite, fits, 1.0 - np.count_nonzero(fits) / len(fits), widest, normal, white)
 
 
 PLACES = types.Array(types.int64, 1, "A", readonly=True)
@@ -343,14 +364,14 @@ def judged_frame(
     P (n, n) is the covariance of the own error and of constants, and `crosses` (k, n, 6) are its covariances with the
     errors of some neighbours. The other arguments are those of `halfway_gain`.
     """
-    residual, H, N, by_target, _, used, angle, ahead = linearise(R, p, kind == RIGHT, frame)
+    residual, H, N, by_target, variance, used, angle, ahead = linearise(R, p, kind == RIGHT, frame)
     whole = joint_jacobian(residual, H, by_target, used, frame, np.eye(6), constants, np.zeros(0, np.int64), 0)
     S = spread(whole, P, N)
     for n in range(len(places)):
         if places[n] >= 0:
             common = product(product(whole[n], crosses[places[n]]), by_target[n].T)
             place(S[n], 0, 0, S[n] + common + common.T)
-    return judged(residual, S, used, angle, ahead)
+    return judged(residual, S, variance, used, angle, ahead)
 
 
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)

@@ -17,12 +17,9 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from coopenv.estimation.poses import Array
-from coopenv.observers.correction import RISK, Constants, joint_jacobian
+from coopenv.observers.correction import RISK, SECOND_ORDER, Constants, joint_jacobian
 from coopenv.observers.frame import Frame
 from coopenv.observers.linearisation import linearise, stacked
-
-SECOND_ORDER = 0.75
-"""Largest mean square of half the square of a normal error, over its squared variance: that of one axis."""
 
 
 @lru_cache

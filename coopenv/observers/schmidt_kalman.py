@@ -72,6 +72,7 @@ class ConsiderFilter(Mekf):
     """Base of the filters that keep cross-covariances; the own error is a left one."""
 
     sends_covariance = True
+    guarded = True
     jointly = True  # whether measurements of a frame must also fit together
 
     @property
@@ -104,7 +105,7 @@ class ConsiderFilter(Mekf):
         self.factor, self.number = self.identity, self.number + 1
         extra = {"factor": factor, "number": np.array([self.number]), **self.extra()}
         position = self.state.p + self.state.R.dot(self.marker)
-        return Message(position, self.state.R, T.dot(self.state.P).dot(T.T), extra)
+        return Message(position, self.state.R, T.dot(self.stated.P).dot(T.T), extra)
 
     def predict(self, tick: Tick) -> None:
         """Append the increment."""
