@@ -44,6 +44,7 @@ from coopenv.estimation.compiled import (
 from coopenv.estimation.poses import Array, solve
 from coopenv.measurements.kinds import MOST_ROWS, unit
 from coopenv.observers.frame import FRAME, Frame, UsableMeasurements
+from coopenv.observers.guard import MOST_DEVIATIONS
 from coopenv.observers.linearisation import (
     FLAG_ROWS,
     FLAGS,
@@ -188,8 +189,7 @@ class Judgement(NamedTuple):
     fits: NDArray[np.bool_]  # (m,) which measurements fit
     rejected: float  # share of the others
     widest: float  # largest trace, rad^2, of the rows of S that measure an angle
-    normal: Array  # (m, r) residuals over their standard deviations, second-order errors included; NaN: not measured
-    white: Array  # (m, r) shares of the sensors in the variances
+    innovations: Array  # (m, 3, r) as the guard takes them, second-order errors included
 
 
 class InnovationGate:
@@ -236,7 +236,7 @@ def judged(
     """Return how measurements with covariances S (m, r, r) are judged; arguments as for `LinearMeasurements`."""
     squared, widest = normalised(residual, S), 0.0
     definite, fits = np.empty(len(S), np.bool_), np.empty(len(S), np.bool_)
-    normal, white = np.full(residual.shape, np.nan), np.ones(residual.shape)
+    innovations = np.zeros((len(S), 3, residual.shape[1]))
     for n in range(len(S)):
         dof, trace = np.count_nonzero(used[n]), 0.0
         for k in range(residual.shape[1]):
@@ -247,8 +247,10 @@ def judged(
         for k in range(residual.shape[1]):
             if used[n, k] and definite[n]:
                 of_row = S[n, k, k] + (SECOND_ORDER * trace * trace if angle[n, k] else 0.0)
-                normal[n, k], white[n, k] = residual[n, k] / math.sqrt(of_row), variance[n, k] / of_row
-    return Judgement(definite, fits, 1.0 - np.count_nonzero(fits) / len(fits), widest, normal, white)
+                innovations[n, 0, k] = min(max(residual[n, k] / math.sqrt(of_row), -MOST_DEVIATIONS), MOST_DEVIATIONS)
+                innovations[n, 1, k] = min(variance[n, k] / of_row, 1.0)
+                innovations[n, 2, k] = math.sqrt(1.0 - innovations[n, 1, k])
+    return Judgement(definite, fits, 1.0 - np.count_nonzero(fits) / len(fits), widest, innovations)
 
 
 PLACES = types.Array(types.int64, 1, "A", readonly=True)

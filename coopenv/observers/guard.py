@@ -19,17 +19,14 @@ Sciences 17(12), 1931.
 import math
 
 import numpy as np
-from numba import types
 from numpy.typing import NDArray
 
-from coopenv.estimation.compiled import MATRIX, TARGET, VECTOR, compiled
 from coopenv.estimation.poses import Array
 from coopenv.measurements.kinds import MOST_ROWS
-from coopenv.observers.linearisation import FLAGS
 
 LENGTHS = (1.0, 4.0)  # s, of blocks
 WINDOW = 10.0  # s: time constant of the totals
-LARGEST = 3.29  # standard deviations to which innovations are limited: one of a thousand is larger
+MOST_DEVIATIONS = 3.29  # to which innovations are limited: one of a thousand is larger
 NORMAL_QUANTILE = 4.75  # that a normal variable exceeds with a probability of 1e-6
 UNKNOWN = 4.0
 """Factor from which on a protection level is unknown: the stated deviations are half of what innovations show."""
@@ -49,27 +46,6 @@ def share_without_largest(count: int) -> float:
     return 1.0 - sum(1.0 / n for n in range(1, count + 1)) / count if count > 1 else 1.0
 
 
-@compiled(types.Array(types.float64, 3, "C"), types.Array(types.int64, 1, "A"), MATRIX, MATRIX, FLAGS)
-def add_innovations(sums: Array, slots: NDArray[np.int64], normal: Array, white: Array, lasting: NDArray[np.bool_]):  # type: ignore[no-untyped-def]
-    """Add innovations (m, r) over their standard deviations to the sums (s, 3, MOST_ROWS) of their sources.
-
-    Args:
-        sums: of innovations, of white shares, and of the roots of the other shares.
-        slots: (m,) of the sources.
-        normal: NaN where nothing was measured.
-        white: (m, r) shares of the variances.
-        lasting: (m,) whether the other shares are those of another vehicle.
-    """
-    for n in range(len(slots)):
-        of = sums[slots[n]]
-        for k in range(normal.shape[1]):
-            if math.isfinite(normal[n, k]):
-                share = white[n, k] if lasting[n] else 1.0
-                of[0, k] += min(max(normal[n, k], -LARGEST), LARGEST)
-                of[1, k] += share
-                of[2, k] += math.sqrt(max(1.0 - share, 0.0))
-
-
 class Guard:
     """The guard of one vehicle."""
 
@@ -80,10 +56,16 @@ class Guard:
         self.begin = np.zeros(len(LENGTHS))  # s, of the blocks
         self.totals = np.zeros((len(LENGTHS), 3))  # of squared sums, of their expectations, and of degrees of freedom
 
-    def add(
-        self, time: float, targets: NDArray[np.int64], normal: Array, white: Array, lasting: NDArray[np.bool_]
-    ) -> None:
-        """Add the innovations of a frame, and end the blocks that are complete; arguments as for `add_innovations`."""
+    def add(self, time: float, targets: NDArray[np.int64], innovations: Array, lasting: NDArray[np.bool_]) -> None:
+        """Add the innovations of a frame, and end the blocks that are complete.
+
+        Args:
+            time: s.
+            targets: (m,) the sources.
+            innovations: (m, 3, r) of rows over their standard deviations; shares of the sensor in the variances; roots
+                of the other shares. 0 where nothing was measured.
+            lasting: (m,) whether the other shares last, because the target is uncertain.
+        """
         for length, begin in enumerate(self.begin.tolist()):
             if time - begin >= LENGTHS[length]:
                 self.end_block(length, time)
@@ -91,8 +73,9 @@ class Guard:
         if len(self.slots) > self.sums.shape[1]:
             more = len(self.slots) - self.sums.shape[1]
             self.sums = np.pad(self.sums, ((0, 0), (0, more), (0, 0), (0, 0)))
-        for sums in self.sums:
-            add_innovations(sums, np.array(slots), normal, white, lasting)
+        innovations[~lasting, 1] = innovations[~lasting, 1] > 0.0
+        innovations[~lasting, 2] = 0.0
+        np.add.at(self.sums, (slice(None), slots, slice(None), slice(innovations.shape[2])), innovations)
 
     def end_block(self, length: int, time: float) -> None:
         """Add a block to its totals, and set the factor."""

@@ -7,8 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
+from coopenv.observers.correction import judged
 from coopenv.observers.guard import Guard, largest_total, share_without_largest
 from coopenv.observers.schmidt_kalman import SchmidtKalman
 from tests.helpers.recordings import completed, simulated
@@ -17,13 +18,18 @@ PERIOD = 0.05  # s
 Innovations = Callable[[int], np.ndarray]
 
 
+def add(guard: Guard, time: float, normal: np.ndarray, white: float = 1.0, lasting: bool = False) -> None:
+    """Add innovations (m, r) over their standard deviations, not measured where NaN."""
+    shares = np.where(np.isnan(normal), 0.0, white), np.where(np.isnan(normal), 0.0, np.sqrt(1.0 - white))
+    count = len(normal)
+    guard.add(time, np.arange(count), np.stack([np.nan_to_num(normal), *shares], axis=1), np.full(count, lasting))
+
+
 def guarded(innovations: Innovations, ticks: int, white: float = 1.0, lasting: bool = False) -> Guard:
-    """Return a guard after innovations (m, 2) over their standard deviations, by tick."""
+    """Return a guard after innovations by tick."""
     guard = Guard()
     for k in range(ticks):
-        normal = innovations(k)
-        count = len(normal)
-        guard.add(k * PERIOD, np.arange(count), normal, np.full(normal.shape, white), np.full(count, lasting))
+        add(guard, k * PERIOD, innovations(k), white, lasting)
     return guard
 
 
@@ -38,10 +44,9 @@ def biased(seed: int, bias: float, sources: int, of: slice = slice(None)) -> Inn
 def test_white_innovations_have_a_factor_of_exactly_one(sources: int) -> None:
     for seed in range(5):
         innovations = biased(seed, 0.0, sources)
-        guard, last = guarded(innovations, 1), 600
-        for k in range(1, last):
-            ones = np.ones((sources, 2))
-            guard.add(k * PERIOD, np.arange(sources), innovations(k), ones, np.zeros(sources, bool))
+        guard = Guard()
+        for k in range(600):
+            add(guard, k * PERIOD, innovations(k))
             assert guard.factor == 1.0
 
 
@@ -72,9 +77,14 @@ def test_one_source_of_several_may_be_wrong() -> None:
     assert guarded(biased(0, 3.0, 3, slice(0, 2)), 400).factor > 10.0
 
 
-def test_innovations_are_limited() -> None:
+def test_innovations_are_limited_to_one_of_a_thousand() -> None:
     """A measurement that its gate refuses counts as one at the gate."""
-    assert guarded(lambda k: np.full((2, 2), 1e6), 400).factor == guarded(lambda k: np.full((2, 2), 4.0), 400).factor
+    every, S = np.ones((2, 2), bool), np.tile(1e-4 * np.eye(2), (2, 1, 1))
+    judgement = judged(np.array([[1.0, -1.0], [1e-3, 0.0]]), S, np.full((2, 2), 4e-5), every, every, every[0])
+    limit = norm.isf(5e-4)
+    assert_allclose(judgement.innovations[:, 0], [[limit, -limit], [0.1, 0.0]], rtol=1e-3)
+    assert_allclose(judgement.innovations[:, 1], 0.4, rtol=1e-3)
+    assert_allclose(judgement.innovations[:, 2] ** 2, 0.6, rtol=1e-3)
 
 
 def test_what_was_not_measured_counts_nothing() -> None:

@@ -19,6 +19,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, cholesky6, eigen_symmetric6, exp_so3, join6, sheared, skew, symmetric_part
 from coopenv.observers.robust import algebra, constants
+from coopenv.observers.robust.guard import guarded_covariance
 from coopenv.observers.robust.memory import (
     Correlation,
     Pose,
@@ -74,7 +75,7 @@ def next_broadcast(model: Any, memory: Any, world: int, i: int, last: int) -> in
 @subroutine
 def own_correlation(model: Any, memory: Any, world: int, i: int, n: int):
     """Return the correlation, 6x6 in whole steps, of the vehicle's left error at its marker with that of a member."""
-    P = memory.P[world, i, 0, 0] + memory.fault_mixture[world, i]
+    P = guarded_covariance(memory, world, i)
     C = memory.P[world, i, 0, n]
     marker = vec3d(model.scene.marker[model.landmarks + i])
     if wp.length_sq(marker) > wp.float64(0.0):

@@ -24,6 +24,7 @@ from coopenv.observers.robust.algebra import (
     recentring,
     with_noise,
 )
+from coopenv.observers.robust.guard import guarded_covariance
 from coopenv.observers.robust.memory import (
     ERRORS,
     MOUNTING,
@@ -84,8 +85,8 @@ def own_estimate(memory: Any, world: int, i: int):
 
 @device_function
 def estimate_with_faults(memory: Any, world: int, i: int):
-    """Return the own estimate with a covariance that includes the mixture of likely faults."""
-    return PoseEstimate(memory.member[world, i, 0].pose, memory.P[world, i, 0, 0] + memory.fault_mixture[world, i])
+    """Return the own estimate with the covariance that is stated."""
+    return PoseEstimate(memory.member[world, i, 0].pose, guarded_covariance(memory, world, i))
 
 
 @subroutine

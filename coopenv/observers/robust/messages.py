@@ -21,6 +21,7 @@ from coopenv.estimation.poses import Array, exp_so3, log_so3
 from coopenv.observers.contract import Estimate, Message, check_estimate, is_definite
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.constants import MAX_CORRELATIONS, MIN_VARIANCE, STEPS
+from coopenv.observers.robust.guard import guarded_covariance
 from coopenv.observers.robust.joint_state import propagate
 from coopenv.observers.robust.memory import Pose, SenderReport, mat66f, vec3d
 from coopenv.world.embedded import Messages
@@ -48,7 +49,7 @@ def own_report(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
     """
     report = SenderReport()
     report.tick = tick
-    P = memory.P[world, i, 0, 0] + memory.fault_mixture[world, i]
+    P = guarded_covariance(memory, world, i)
     if memory.search[world, i].active == 0 and algebra.is_known(P):
         marker = vec3d(model.scene.marker[model.landmarks + i])
         if wp.length_sq(marker) > wp.float64(0.0):
