@@ -317,6 +317,15 @@ class SchmidtKalman(ConsiderFilter):
         return by_one + by_other.T
 
 
+class SchmidtKalmanIndividual(SchmidtKalman):
+    """Considers neighbours, and tests each measurement alone.
+
+    It is `schmidt_kalman` without the joint gate and without the guard of its covariance.
+    """
+
+    guarded = jointly = False
+
+
 def sent_cross_covariance(message: Message, target: int) -> Array:
     """Return the sent cross-covariance (6, 6) of a sender with a target, zero if the message has none."""
     targets, cross = (np.asarray(message.extra.get(name, ())) for name in ("targets", "cross"))
