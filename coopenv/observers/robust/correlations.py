@@ -19,7 +19,6 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, cholesky6, eigen_symmetric6, exp_so3, join6, sheared, skew, symmetric_part
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.guard import guarded_covariance
 from coopenv.observers.robust.memory import (
     Correlation,
     Pose,
@@ -32,7 +31,7 @@ from coopenv.observers.robust.memory import (
     vec3d,
 )
 from coopenv.observers.robust.messages import dependents, depends_on_own, own_report
-from coopenv.observers.robust.sources import is_excluded
+from coopenv.observers.robust.sources import guarded_covariance, is_excluded
 from coopenv.world.nearby import agent_of, box_of, box_of_entry, entry_at, entry_count, is_target
 from coopenv.world.v2x import content_tick
 from coopenv.world.warp_internals import device_function, subroutine

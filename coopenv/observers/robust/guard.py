@@ -16,18 +16,6 @@ from coopenv.world.warp_internals import device_function, subroutine
 ROWS = 2  # of a bearing
 
 
-@device_function
-def guard_factor(memory: Any, world: int, i: int):
-    """Return the factor on the covariance of the own pose that is stated and broadcast."""
-    return wp.max(memory.belief[world, i].guard.factor, wp.float64(1.0))
-
-
-@device_function
-def guarded_covariance(memory: Any, world: int, i: int):
-    """Return the covariance (6, 6) of the own pose that is stated and broadcast, likely faults included."""
-    return guard_factor(memory, world, i) * (memory.P[world, i, 0, 0] + memory.fault_mixture[world, i])
-
-
 @wp.func
 def share_without_largest(count: int):
     """Return the expected sum of all but the largest of squared sums, see `guard.share_without_largest`."""

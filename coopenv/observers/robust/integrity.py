@@ -34,7 +34,6 @@ from coopenv.estimation.linalg import block3
 from coopenv.observers.guard import UNKNOWN
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import KNOWN_ANGLE_VARIANCE, KNOWN_POSITION_VARIANCE, diagonal_by_rows
-from coopenv.observers.robust.guard import guard_factor, guarded_covariance
 from coopenv.observers.robust.memory import (
     ERRORS,
     FOCAL_ERROR,
@@ -55,6 +54,8 @@ from coopenv.observers.robust.sources import (
     VELOCITY,
     clear_drift,
     clear_source,
+    guard_factor,
+    guarded_covariance,
     is_active,
     is_own,
     is_rejected,

@@ -24,7 +24,6 @@ from coopenv.observers.robust.algebra import (
     recentring,
     with_noise,
 )
-from coopenv.observers.robust.guard import guarded_covariance
 from coopenv.observers.robust.memory import (
     ERRORS,
     MOUNTING,
@@ -40,7 +39,7 @@ from coopenv.observers.robust.memory import (
     vec4d,
     vec6d,
 )
-from coopenv.observers.robust.sources import VELOCITY, is_seen, propagate_sources
+from coopenv.observers.robust.sources import VELOCITY, guarded_covariance, is_seen, propagate_sources
 from coopenv.world.nearby import agent_of, entry_at, entry_count
 from coopenv.world.warp_internals import device_function, subroutine
 
