@@ -12,6 +12,7 @@ from scipy.stats import chi2, norm
 from coopenv.observers.correction import judged
 from coopenv.observers.guard import Guard, largest_total, share_without_largest
 from coopenv.observers.schmidt_kalman import SchmidtKalman
+from coopenv.observers.self_calibrating import SelfCalibrating
 from tests.helpers.recordings import completed, simulated
 
 PERIOD = 0.05  # s
@@ -126,3 +127,14 @@ def test_the_factor_multiplies_what_is_stated_and_not_the_gain() -> None:
     assert_allclose(doubted.covariance[1:, 0], 9.0 * trusting.covariance[1:, 0], rtol=1e-12)
     assert (doubted.position[:, 0] == trusting.position[:, 0]).all()  # it measures landmarks alone
     assert np.trace(doubted.covariance[-1, 1]) > np.trace(9.0 * trusting.covariance[-1, 1])  # of what it receives
+
+
+def test_a_neighbour_corrects_no_estimate_whose_covariance_has_a_factor() -> None:
+    made = simulated()
+    observer = SelfCalibrating(made.setups[0])
+    observer.reset((made.start_rotation[0], made.start_position[0]), 1e-4 * np.eye(6))
+    numbers = []
+    for factor in (1.0, 9.0, 1.0):
+        observer.guard.factor = factor
+        numbers.append(int(observer.message().extra["number"][0]))
+    assert [*observer.since] == [numbers[0], numbers[2]]
