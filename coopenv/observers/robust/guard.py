@@ -14,6 +14,8 @@ from coopenv.observers.robust.memory import SOURCES, BearingFrame
 from coopenv.world.warp_internals import device_function, subroutine
 
 ROWS = 2  # of a bearing
+COUNT = len(LENGTHS)
+SHORT, LONG = LENGTHS
 
 
 @wp.func
@@ -52,7 +54,7 @@ def add_innovation(memory: Any, world: int, i: int, n: int):
             white = wp.float64(1.0)
             if memory.measurement[world, i, n].member > 0:
                 white = noise / variance
-            for length in range(len(LENGTHS)):
+            for length in range(COUNT):
                 sums.innovation[length, k] += wp.clamp(residual[k] / wp.sqrt(variance), -limit, limit)
                 sums.white[length, k] += white
                 sums.lasting[length, k] += wp.sqrt(wp.float64(1.0) - white)
@@ -95,7 +97,7 @@ def end_guard_block(memory: Any, world: int, i: int, length: int):
     totals.expected[length] = kept * totals.expected[length] + share * rows
     totals.freedom[length] = kept * totals.freedom[length] + share * freedom
     totals.factor = wp.float64(1.0)
-    for n in range(len(LENGTHS)):
+    for n in range(COUNT):
         totals.factor = wp.max(totals.factor, factor_of(totals.squared[n], totals.expected[n], totals.freedom[n]))
     memory.belief[world, i].guard = totals
 
@@ -106,10 +108,9 @@ def guard_covariance(frame: BearingFrame, memory: Any, world: int, i: int):
     for n in range(frame.bearings):
         if memory.measurement[world, i, n].source >= 0 and memory.measurement[world, i, n].fits != 0:
             add_innovation(memory, world, i, n)
-    for length in range(len(LENGTHS)):
+    for length in range(COUNT):
         totals = memory.belief[world, i].guard
         totals.time[length] += frame.period
         memory.belief[world, i].guard = totals
-        limit = wp.where(length == 0, wp.float64(LENGTHS[0]), wp.float64(LENGTHS[1]))
-        if totals.time[length] >= limit:
+        if totals.time[length] >= wp.where(length == 0, wp.float64(SHORT), wp.float64(LONG)):
             end_guard_block(memory, world, i, length)
