@@ -122,7 +122,7 @@ class Mekf(PoseObserver):
             kept = self.gate.passed(tick.time, judgement)
             if self.guarded:
                 of_vehicles = measured.targets >= len(tick.landmarks)
-                self.guard.add(tick.time, measured.targets, judgement.innovations, of_vehicles)
+                self.guard.add(tick.time, measured.targets, judgement[-1], of_vehicles)
             if not kept.all():
                 measured = measured.only(kept)
         if len(measured.entries):
