@@ -51,6 +51,7 @@ from coopenv.observers.correction import (
     judged_frame,
 )
 from coopenv.observers.frame import FRAME, Frame, UsableMeasurements
+from coopenv.observers.joint_gate import fitting_together, innovation, largest_of
 from coopenv.observers.pose_filters import Mekf
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, moved, recentring, transition
 
@@ -71,6 +72,8 @@ class ConsiderFilter(Mekf):
     """Base of the filters that keep cross-covariances; the own error is a left one."""
 
     sends_covariance = True
+    guarded = True
+    jointly = True  # whether measurements of a frame must also fit together
 
     @property
     def covariance(self) -> Array:
@@ -102,7 +105,7 @@ class ConsiderFilter(Mekf):
         self.factor, self.number = self.identity, self.number + 1
         extra = {"factor": factor, "number": np.array([self.number]), **self.extra()}
         position = self.state.p + self.state.R.dot(self.marker)
-        return Message(position, self.state.R, T.dot(self.state.P).dot(T.T), extra)
+        return Message(position, self.state.R, T.dot(self.stated.P).dot(T.T), extra)
 
     def predict(self, tick: Tick) -> None:
         """Append the increment."""
@@ -164,7 +167,13 @@ class ConsiderFilter(Mekf):
         seen, places = self.places(measured)
         of = [self.neighbours[t] for t in seen]
         joint = made_definite(self.joint_covariance(seen, between), len(self.covariance))
-        R, p, P, change, carried, crosses, nis, dof = self.considered(joint, measured.exact().frame, places)
+        frame = measured.exact().frame
+        made = self.considered(joint, frame, places)
+        if self.jointly and not self.gate.is_open and made[6] > largest_of(made[7]):
+            kept = fitting_together(*innovation(*self.state[1:3], joint, frame, self.constants, places), len(places))
+            self.gate.refuse(int((~kept).sum()))
+            made = self.considered(joint, (frame[0][kept], *frame[1:]), places[kept])
+        R, p, P, change, carried, crosses, nis, dof = made
         self.set_corrected(R, p, P, change)
         self.propagate_cross_covariances(carried, [t for t in self.neighbours if t not in seen])
         for target, was, cross in zip(seen, of, crosses, strict=True):
@@ -306,6 +315,15 @@ class SchmidtKalman(ConsiderFilter):
     def between(by_one: Array, by_other: Array) -> Array:
         """Return the cross-covariance (6, 6) of two neighbours from what the two have sent; one of them knows it."""
         return by_one + by_other.T
+
+
+class SchmidtKalmanIndividual(SchmidtKalman):
+    """Considers neighbours, and tests each measurement alone.
+
+    It is `schmidt_kalman` without the joint gate and without the guard of its covariance.
+    """
+
+    guarded = jointly = False
 
 
 def sent_cross_covariance(message: Message, target: int) -> Array:
