@@ -1,11 +1,14 @@
 """Lasting errors of odometry, camera and other sensors as states of a filter, and what they change.
 
+A frame that is older by a time than stated shows what the vehicle measures at a pose with a left error of minus its
+twist times that time, and targets where they were. The jitter of that time is an error that is drawn for every frame.
+
 Source of the errors of a differential drive: Borenstein and Feng, Measurement and correction of systematic odometry
 errors in mobile robots, IEEE Transactions on Robotics and Automation 12(6), 1996 (unequal wheels: `curvature`, unknown
 wheelbase: `turn_scale`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,12 +17,27 @@ from coopenv.estimation.compiled import cross_matrix, exp_so3, right_jacobian
 from coopenv.estimation.poses import Array, log_so3
 from coopenv.measurements.sensor import Sensor
 from coopenv.observers.contract import SensorNoise, Tick
-from coopenv.observers.correction import BY_ROW, BY_VALUE
+from coopenv.observers.correction import BY_POSE, BY_ROW, BY_TIME, BY_VALUE
 from coopenv.observers.frame import CAMERA
 
-SCALE, TURN_SCALE, CURVATURE, LOSS, LEAD = 0, 1, 5, 6, 7
-GYRO, ORIENTATION = slice(2, 5), slice(8, 11)
-STATES = 11
+PLACES = {
+    "odometry_scale": slice(0, 1),
+    "turn_scale": slice(1, 2),
+    "gyro_bias": slice(2, 5),
+    "curvature": slice(5, 6),
+    "turning_loss": slice(6, 7),
+    "odometry_lead": slice(7, 8),
+    "camera_orientation": slice(8, 11),
+    "camera_position": slice(11, 14),
+    "latency": slice(14, 15),
+    "latency_jitter": slice(15, 16),
+}
+"""Places among the states of the errors that `SensorNoise` declares; biases and scales of other sensors follow."""
+STATES = 16
+SENSORS = "sensors"
+"""Name of the biases and scales of other sensors than the camera."""
+EVERY = (*PLACES, SENSORS)
+SCALE, TURN_SCALE, GYRO, CURVATURE, LOSS, LEAD, ORIENTATION, POSITION, LATENCY, JITTER = PLACES.values()
 FORWARD, UP = 0, 2
 
 
@@ -32,44 +50,52 @@ class CalibratedStep(NamedTuple):
 
 
 class LastingErrors:
-    """The lasting errors of one vehicle that its noise and sensors declare: the c with a standard deviation."""
+    """The lasting errors of one vehicle that its noise and sensors declare: the c with a standard deviation.
 
-    def __init__(self, noise: SensorNoise, sensors: Sequence[Sensor] = ()) -> None:
-        std, walk = np.zeros(STATES), np.zeros(STATES)
-        std[SCALE], walk[SCALE] = noise.odometry_scale, noise.odometry_scale_walk
-        std[GYRO], walk[GYRO] = noise.gyro_bias, noise.gyro_bias_walk
-        std[[TURN_SCALE, CURVATURE, LOSS, LEAD]] = (
-            noise.turn_scale,
-            noise.curvature,
-            noise.turning_loss,
-            noise.odometry_lead,
-        )
-        std[ORIENTATION] = noise.camera_orientation
+    The first of them are those that a filter estimates; it considers the others, whose values stay zero.
+    """
+
+    def __init__(self, noise: SensorNoise, sensors: Sequence[Sensor] = (), estimated: Collection[str] = EVERY) -> None:
+        std, walk = np.zeros((2, STATES))
+        for name, at in PLACES.items():
+            std[at], walk[at] = getattr(noise, name), getattr(noise, f"{name}_walk", 0.0)
         self.sensors = len(sensors)
         self.of_sensors = {n: sensor.kind.rows for n, sensor in enumerate(sensors) if any(sensor.bias) or sensor.scale}
         declared = [[*(sensors[n].bias or np.zeros(rows)), sensors[n].scale] for n, rows in self.of_sensors.items()]
         std = np.concatenate([std, *declared])
-        self.count = len(std)
-        walk = np.pad(walk, (0, self.count - STATES))
-        self.states = np.flatnonzero(std + walk)
+        self.size = len(std)
+        walk = np.pad(walk, (0, self.size - STATES))
+        considered = np.full(self.size, SENSORS not in estimated)
+        for name, at in PLACES.items():
+            considered[at] = name not in estimated
+        found = np.flatnonzero(std + walk)
+        self.states = found[np.argsort(considered[found], kind="stable")]
+        self.estimated = int((~considered[found]).sum())
         self.variances = np.square(std[self.states])
         self.walk = np.square(walk[self.states])  # per s
+        self.lasts = np.where(self.states == JITTER.start, 0.0, 1.0)
+        """(c,) 1 if an error lasts, 0 if it is drawn for every frame."""
+        self.moves = bool((np.isin(self.states, (LATENCY.start, JITTER.start))).any())
 
     def reset(self) -> None:
         """Forget the last sample."""
         self.before = np.zeros((2, 3))
 
+    def noise(self, dt: float) -> Array:
+        """Return the variances (c,) by which the errors grow over a time, s."""
+        return self.walk * dt + (1.0 - self.lasts) * self.variances
+
     def step(self, tick: Tick, values: Array) -> CalibratedStep:
         """Return the increment of a tick, given values (c,) of the lasting errors."""
         turn, move = log_so3(tick.rotation), np.asarray(tick.translation, float)
         now = np.array([tick.angular_velocity, tick.velocity])
-        J = np.zeros((6, self.count))
-        J[3:, SCALE] = -move
-        J[:3, TURN_SCALE] = -turn
+        J = np.zeros((6, self.size))
+        J[3:, SCALE] = -move[:, None]
+        J[:3, TURN_SCALE] = -turn[:, None]
         J[:3, GYRO] = -tick.dt * np.eye(3)
         J[UP, CURVATURE] = move[FORWARD]
-        J[3:, LOSS] = -move * np.linalg.norm(turn) / tick.dt
-        J[:, LEAD] = (self.before - now).ravel()
+        J[3:, LOSS] = -move[:, None] * np.linalg.norm(turn) / tick.dt
+        J[:, LEAD] = (self.before - now).reshape(-1, 1)
         self.before, J = now, J[:, self.states]
         correction = J @ values
         turn, move = turn + correction[:3], move + correction[3:]
@@ -77,14 +103,22 @@ class LastingErrors:
         by_errors = np.concatenate([right_jacobian(turn) @ J[:3], rotation.T @ J[3:]])
         return CalibratedStep(rotation, move, by_errors)
 
-    def by_sensor(self, lever_arm: Array) -> Array:
+    def by_sensor(self, lever_arm: Array, velocity: Array, angular_velocity: Array) -> Array:
         """Return what they change in measurements of the camera and of the other sensors, see `Constants`.
 
         An error of the camera's orientation moves a bearing as a turn of the vehicle about the camera.
+
+        Args:
+            lever_arm: (3,) the camera's place in the body, m.
+            velocity: (3,) of the vehicle, body axes, m/s.
+            angular_velocity: (3,) likewise, rad/s.
         """
-        changed = np.zeros((self.sensors + 1, BY_VALUE + 1, self.count))
-        changed[CAMERA, :3, ORIENTATION] = np.eye(3)
+        changed = np.zeros((self.sensors + 1, BY_TIME + 1, self.size))
+        changed[CAMERA, :3, ORIENTATION] = changed[CAMERA, 3:6, POSITION] = np.eye(3)
         changed[CAMERA, 3:6, ORIENTATION] = cross_matrix(np.asarray(lever_arm, float))
+        for late in (LATENCY, JITTER):
+            changed[CAMERA, BY_POSE, late] = -np.concatenate([angular_velocity, velocity])[:, None]
+            changed[CAMERA, BY_TIME, late] = -1.0
         first = STATES
         for sensor, rows in self.of_sensors.items():
             of = changed[CAMERA + 1 + sensor]

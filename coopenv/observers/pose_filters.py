@@ -47,6 +47,8 @@ class PoseObserver:
     def __init__(self, setup: Setup) -> None:
         self.marker = setup.marker  # the point that sensors of other vehicles measure
         self.needed = {name for sensor in setup.sensors for name in sensor.kind.needs}
+        if setup.noise.latency or setup.noise.latency_jitter:
+            self.needed.add("velocity")
         self.twist = np.zeros(3), np.zeros(3)  # m/s and rad/s, body axes
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
@@ -63,7 +65,7 @@ class PoseObserver:
         return Message(position=position, covariance=covariance, extra=self.extra())
 
     def extra(self) -> dict[str, Array]:
-        """Return the velocity of the marker, map, m/s, if sensors need it."""
+        """Return the velocity of the marker, map, m/s, if sensors or late frames need it."""
         if "velocity" not in self.needed:
             return {}
         velocity, rate = self.twist
@@ -87,6 +89,8 @@ class Mekf(PoseObserver):
 
     def update(self, tick: Tick) -> Estimate:
         """Predict, then correct by every usable bearing."""
+        if tick.bearing_age > 0.0:
+            self.needed.add("velocity")
         self.predict(tick)
         self.nis: float | None = None
         self.nis_dof = 0
@@ -358,17 +362,18 @@ class PerspectivePoints(PoseObserver):
             self.contradicted = 0.0 if expected else self.contradicted + tick.dt
             if expected and self.state.P[0, 0] + self.state.P[1, 1] + self.state.P[2, 2] < NARROW_STD**2:
                 return  # weak geometry at a plausible pose
-            found = self.chosen(tick, data)
+            found = self.chosen(data)
         if found is not None and (distance(found, self.state) < POSE_GATE or self.contradicted > PATIENCE):
             self.state, self.contradicted = found, 0.0
 
-    def chosen(self, tick: Tick, data: UsableMeasurements) -> UncertainPose | None:
+    def chosen(self, data: UsableMeasurements) -> UncertainPose | None:
         """Return the candidate that agrees with most bearings, then the one nearest to the predicted pose."""
         best, most, nearest = None, 3, inf
         triples = np.array([*islice(combinations(range(len(data.bearings)), 3), MOST_TRIPLES)])
         turns, cameras, mask = solve_p3p(data.bearings[triples], data.positions[triples])
+        lever_arm = data.sensors["position"][CAMERA]
         for R, camera in zip(turns[mask], cameras[mask], strict=True):
-            start = UncertainPose(LEFT, R, camera - R @ tick.lever_arm, self.state.P)
+            start = UncertainPose(LEFT, R, camera - R @ lever_arm, self.state.P)
             agrees = misfits(start, data) < BEARING_GATE
             if (count := int(agrees.sum())) < most:
                 continue

@@ -87,7 +87,8 @@ def test_a_turned_camera_moves_bearings_as_its_derivative_says() -> None:
         """Return residuals and derivatives of bearings, given the camera's turn."""
         entries = measured.entries.copy()
         entries["value"][:, :3] = bearings
-        frame, constants = measured._replace(entries=entries).frame, (lasting.by_sensor(tick.lever_arm), values)
+        frame = measured._replace(entries=entries).frame
+        constants = lasting.by_sensor(tick.lever_arm, np.zeros(3), np.zeros(3)), values, len(values)
         residual, H, _ = looked(LEFT, pose.R, pose.p, np.eye(6), np.zeros(9), frame, constants, NO_PLACES)
         return residual, H
 
