@@ -91,8 +91,7 @@ class ConsiderFilter(Mekf):
         self.from_marker = adjoint(np.eye(3), marker)
         self.landmarks = setup.landmarks
         self.lasting = LastingErrors(setup.noise, setup.sensors, self.estimated)
-        self.lever_arm, still = np.asarray(setup.lever_arm, float), np.zeros(3)
-        self.by_sensor = self.lasting.by_sensor(self.lever_arm, still, still)
+        self.lever_arm = np.asarray(setup.lever_arm, float)
         map_std = np.zeros(self.landmarks) if setup.landmark_std is None else np.asarray(setup.landmark_std, float)
         self.map_covariances = {
             int(n): np.diag([*[LEAST_VARIANCE] * 3, *[map_std[n] ** 2] * 3])
@@ -106,6 +105,7 @@ class ConsiderFilter(Mekf):
         self.values = np.zeros(len(self.lasting.states))
         self.P = block_diag(self.state.P, np.diag(self.lasting.variances)) if len(self.values) else self.state.P
         self.lasting.reset()
+        self.by_sensor = self.lasting.by_sensor(self.lever_arm)
         unknown = np.zeros((len(self.P), 6))
         self.neighbours = {n: ConsideredNeighbour(0, P, unknown) for n, P in self.map_covariances.items()}
         self.identity = np.eye(len(self.P))
@@ -138,9 +138,9 @@ class ConsiderFilter(Mekf):
             self.P = self.state.P
             return
         self.twist = tick.velocity, tick.angular_velocity
-        if self.lasting.moves:
-            self.by_sensor = self.lasting.by_sensor(self.lever_arm, *self.twist)
         step, noise, lasts = self.lasting.step(tick, self.values), tick.noise.odometry(tick.dt), self.lasting.lasts
+        if self.lasting.late:
+            self.by_sensor = self.lasting.by_sensor(self.lever_arm)
         A = self.identity.copy()
         A[:6, :6], A[:6, 6:], A[6:, 6:] = transition(step.rotation, step.translation), step.by_errors, np.diag(lasts)
         self.values = lasts * self.values
