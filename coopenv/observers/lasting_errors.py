@@ -10,17 +10,17 @@ errors in mobile robots, IEEE Transactions on Robotics and Automation 12(6), 199
 wheelbase: `turn_scale`).
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
 
 from coopenv.estimation.compiled import cross_matrix, exp_so3, right_jacobian
 from coopenv.estimation.poses import Array, log_so3
-from coopenv.measurements.sensor import Sensor
-from coopenv.observers.contract import SensorNoise, Tick
-from coopenv.observers.correction import BY_POSE, BY_ROW, BY_TIME, BY_VALUE
+from coopenv.observers.contract import Setup, Tick
+from coopenv.observers.correction import BY_POSE, BY_ROW, BY_TIME, BY_VALUE, CURVATURE_TIME
 from coopenv.observers.frame import CAMERA
+from coopenv.observers.linearisation import LinearMeasurements
 
 PLACES = {
     "odometry_scale": slice(0, 1),
@@ -60,7 +60,9 @@ class LastingErrors:
     The first of them are those that a filter estimates; it considers the others, whose values stay zero.
     """
 
-    def __init__(self, noise: SensorNoise, sensors: Sequence[Sensor] = (), estimated: Collection[str] = EVERY) -> None:
+    def __init__(self, setup: Setup, estimated: Collection[str] = EVERY) -> None:
+        noise, sensors = setup.noise, setup.sensors
+        self.lever_arm = np.asarray(setup.lever_arm, float)
         std, walk = np.zeros((2, STATES))
         for name, at in PLACES.items():
             std[at], walk[at] = getattr(noise, name), getattr(noise, f"{name}_walk", 0.0)
@@ -83,6 +85,8 @@ class LastingErrors:
         self.lasts = 1.0 - np.isin(self.states, (JITTER.start, MANOEUVRE))
         """(c,) 1 if an error lasts, 0 if it is drawn for every frame."""
         self.late = bool(noise.latency or noise.latency_jitter)
+        self.counts = self.late or noise.camera_orientation_walk > 0.0 or setup.landmark_std is not None
+        """Whether `counted` finds any."""
 
     def reset(self) -> None:
         """Forget the last sample and the twist."""
@@ -113,15 +117,14 @@ class LastingErrors:
         by_errors = np.concatenate([right_jacobian(turn) @ J[:3], rotation.T @ J[3:]])
         return CalibratedStep(rotation, move, by_errors)
 
-    def by_sensor(self, lever_arm: Array) -> Array:
+    def by_sensor(self) -> Array:
         """Return what they change in measurements of the camera and of the other sensors, see `Constants`.
 
-        An error of the camera's orientation moves a bearing as a turn of the vehicle about the camera. The camera is at
-        the lever arm (3,) in the body, m.
+        An error of the camera's orientation moves a bearing as a turn of the vehicle about the camera.
         """
         changed = np.zeros((self.sensors + 1, BY_TIME + 1, self.size))
         changed[CAMERA, :3, ORIENTATION] = changed[CAMERA, 3:6, POSITION] = np.eye(3)
-        changed[CAMERA, 3:6, ORIENTATION] = cross_matrix(np.asarray(lever_arm, float))
+        changed[CAMERA, 3:6, ORIENTATION] = cross_matrix(self.lever_arm)
         changed[CAMERA, BY_POSE, LATENCY.start] = -self.averaged
         changed[CAMERA, BY_POSE, MANOEUVRE] = self.averaged - self.twist
         changed[CAMERA, BY_POSE, JITTER.start] = -self.twist
@@ -133,3 +136,25 @@ class LastingErrors:
             of[BY_VALUE, first + rows] = 1.0
             first += rows + 1
         return np.ascontiguousarray(changed[..., self.states])
+
+    def counted(self, tick: Tick, linear: LinearMeasurements) -> Array:
+        """Return variances (m, r) of rows, linearised by a left error, for a filter without states of these errors.
+
+        Errors of late frames, of a mounting that walks and of the map count as noise of so many times their variance as
+        frames have the same error.
+        """
+        self.step(tick, np.zeros(len(self.states)))
+        frames, measured = max(CURVATURE_TIME / tick.dt, 1.0), linear.measured
+        changed = self.by_sensor()[measured.entries["sensor"]]
+        columns = linear.H @ changed[:, BY_POSE]
+        by_place = linear.by_target[..., 3:] @ measured.axes.swapaxes(1, 2)  # map axes
+        velocity = np.nan_to_num(measured.entries["velocity"])
+        columns += (by_place @ velocity[..., None]) * changed[:, None, BY_TIME]
+        late = np.where(np.isin(self.states, (LATENCY.start, JITTER.start, MANOEUVRE)), self.variances, 0.0)
+        variances = late * np.where(self.lasts > 0.0, frames, 1.0) + self.walk * CURVATURE_TIME * frames
+        found = np.square(columns) @ variances
+        if tick.landmark_std is not None:
+            of_landmark = measured.targets < len(tick.landmark_std)
+            std = np.where(of_landmark & (measured.targets >= 0), tick.landmark_std[measured.targets * of_landmark], 0.0)
+            found += frames * std[:, None] ** 2 * np.sum(by_place**2, axis=-1)
+        return np.asarray(found)

@@ -32,6 +32,7 @@ from coopenv.observers.correction import (
 )
 from coopenv.observers.frame import CAMERA, FRAME, Frame, UsableMeasurements, usable_measurements
 from coopenv.observers.kernel_observer import KernelObserver
+from coopenv.observers.lasting_errors import LastingErrors
 from coopenv.observers.linearisation import LinearMeasurements, across, dense, linearised, normalised
 from coopenv.observers.p3p import solve_p3p
 from coopenv.observers.riccati import RICCATI
@@ -80,11 +81,18 @@ class Mekf(PoseObserver):
 
     sends_covariance = False
     gated = True  # else every bearing is used
+    counts_errors = True  # whether declared errors of sensors and map count as noise
+
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(setup)
+        self.lasting = LastingErrors(setup)
+        self.counts_errors = self.counts_errors and self.lasting.counts
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
         super().reset(initial_pose, initial_covariance)
         self.gate = InnovationGate()
+        self.lasting.reset()
         self.measured: dict[int, float] = {}  # s, time of the last measurement of each sensor beside the camera
 
     def update(self, tick: Tick) -> Estimate:
@@ -108,6 +116,9 @@ class Mekf(PoseObserver):
         """Correct by the bearings that pass the gate."""
         if len(measured.sensors) > 1:
             self.add_curvature(tick, measured)
+        if self.counts_errors:
+            variances = self.lasting.counted(tick, linearised(self.state._replace(kind=LEFT), measured))
+            measured.entries["curvature"][:, : variances.shape[1]] += variances
         if self.gated:
             kept = self.gate.passed(tick.time, self.judged(measured))
             if not kept.all():

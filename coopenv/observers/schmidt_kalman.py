@@ -82,6 +82,7 @@ class ConsiderFilter(Mekf):
     """
 
     sends_covariance = True
+    counts_errors = False
     estimated: ClassVar[Collection[str]] = ()
 
     def __init__(self, setup: Setup) -> None:
@@ -90,8 +91,7 @@ class ConsiderFilter(Mekf):
         self.to_marker = adjoint(np.eye(3), -marker)  # own left error to that of the marker's pose
         self.from_marker = adjoint(np.eye(3), marker)
         self.landmarks = setup.landmarks
-        self.lasting = LastingErrors(setup.noise, setup.sensors, self.estimated)
-        self.lever_arm = np.asarray(setup.lever_arm, float)
+        self.lasting = LastingErrors(setup, self.estimated)
         map_std = np.zeros(self.landmarks) if setup.landmark_std is None else np.asarray(setup.landmark_std, float)
         self.map_covariances = {
             int(n): np.diag([*[LEAST_VARIANCE] * 3, *[map_std[n] ** 2] * 3])
@@ -105,7 +105,7 @@ class ConsiderFilter(Mekf):
         self.values = np.zeros(len(self.lasting.states))
         self.P = block_diag(self.state.P, np.diag(self.lasting.variances)) if len(self.values) else self.state.P
         self.lasting.reset()
-        self.by_sensor = self.lasting.by_sensor(self.lever_arm)
+        self.by_sensor = self.lasting.by_sensor()
         unknown = np.zeros((len(self.P), 6))
         self.neighbours = {n: ConsideredNeighbour(0, P, unknown) for n, P in self.map_covariances.items()}
         self.identity = np.eye(len(self.P))
@@ -140,7 +140,7 @@ class ConsiderFilter(Mekf):
         self.twist = tick.velocity, tick.angular_velocity
         step, noise, lasts = self.lasting.step(tick, self.values), tick.noise.odometry(tick.dt), self.lasting.lasts
         if self.lasting.late:
-            self.by_sensor = self.lasting.by_sensor(self.lever_arm)
+            self.by_sensor = self.lasting.by_sensor()
         A = self.identity.copy()
         A[:6, :6], A[:6, 6:], A[6:, 6:] = transition(step.rotation, step.translation), step.by_errors, np.diag(lasts)
         self.values = lasts * self.values
@@ -206,7 +206,7 @@ class ConsiderFilter(Mekf):
         of, own = [self.neighbours[t] for t in seen], len(self.P)
         joint = made_definite(self.joint_covariance(seen, between), own)
         R, p, P, change, remaining, crosses, nis, dof = self.considered(joint, measured.exact().frame, places)
-        carried = eliminated(joint[:own, :own], joint[:own].dot(remaining.T)).T
+        carried = factor_of(joint, remaining)
         for n, target in enumerate(self.unseen(seen), len(seen)):
             number, variances, cross = self.neighbours[target]
             if between is not None:
@@ -289,6 +289,16 @@ def considered_from(
     for n in range(len(crosses)):
         place(crosses[n], 0, 0, product(recentred, after[:own, own + 6 * n : own + 6 * n + 6]))
     return R, p, P, change, remaining, crosses, nis, len(N)
+
+
+@compiled(MATRIX, MATRIX)
+def factor_of(joint: Array, remaining: Array) -> Array:
+    """Return the factor (n, n) of cross-covariances with others, from the joint covariance before a correction.
+
+    `remaining` (n, n + 6k) is what remains of the errors before. Where all own errors are estimated it is P+ P-^-1.
+    """
+    own = len(remaining)
+    return eliminated(joint[:own, :own], product(remaining, joint[:, :own]).T).T
 
 
 @compiled(MATRIX, VECTOR, MATRIX, FRAME, CONSTANTS, PLACES)
