@@ -74,7 +74,7 @@ def error_states(recording: Recording) -> tuple[list[int], Array, Array]:
 
 def map_variances(recording: Recording) -> Array:
     """Return (L,) the variances of the landmarks' positions per axis, m^2; setups that state none have exact maps."""
-    stated = [setup.landmark_std for setup in recording.setups if setup.landmark_std is not None]
+    stated = [setup.landmark_std for setup in recording.setups if setup.landmark_std]
     return np.square(np.max(stated, axis=0)) if stated else np.zeros(recording.landmarks.shape[1])
 
 

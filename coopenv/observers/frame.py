@@ -142,7 +142,7 @@ def usable_measurements(tick: Tick, weighed: bool = True) -> UsableMeasurements 
             _put_report(entries, n, message)
             if "velocity" in message.extra:
                 entries["velocity"][n] = np.nan_to_num(_velocity_of(message))
-        elif tick.landmark_std is not None:
+        elif tick.landmark_std:
             _put_accuracy(entries, n, tick)
     for n, (number, target, value, message) in enumerate(others, count):
         entries["sensor"][n], targets[n], values[n, : len(value)] = number, target, value
@@ -156,7 +156,7 @@ def usable_measurements(tick: Tick, weighed: bool = True) -> UsableMeasurements 
             rotation = IDENTITY if tick.landmark_rotation is None else tick.landmark_rotation[target]
             entries["rotation"][n] = rotation
             entries["velocity"][n] = 0.0 if np.isfinite(rotation).all() else np.nan
-            if tick.landmark_std is not None:
+            if tick.landmark_std:
                 _put_accuracy(entries, n, tick)
     lever_arm, readings = np.asarray(tick.lever_arm, float), [reading.sensor for reading in tick.readings]
     if tick.bearing_age > 0.0:
@@ -203,7 +203,6 @@ def _put_accuracy(entries: NDArray[Any], n: int, tick: Tick) -> None:
     target = int(entries["target"][n])
     if tick.landmark_rotation is not None:
         entries["rotation"][n] = tick.landmark_rotation[target]
-    assert tick.landmark_std is not None
     entries["covariance"][n, 3:, 3:] = tick.landmark_std[target] ** 2 * IDENTITY
 
 

@@ -85,7 +85,7 @@ class LastingErrors:
         self.lasts = 1.0 - np.isin(self.states, (JITTER.start, MANOEUVRE))
         """(c,) 1 if an error lasts, 0 if it is drawn for every frame."""
         self.late = bool(noise.latency or noise.latency_jitter)
-        self.counts = self.late or noise.camera_orientation_walk > 0.0 or setup.landmark_std is not None
+        self.counts = self.late or noise.camera_orientation_walk > 0.0 or bool(setup.landmark_std)
         """Whether `counted` finds any."""
 
     def reset(self) -> None:
@@ -153,8 +153,8 @@ class LastingErrors:
         late = np.where(np.isin(self.states, (LATENCY.start, JITTER.start, MANOEUVRE)), self.variances, 0.0)
         variances = late * np.where(self.lasts > 0.0, frames, 1.0) + self.walk * CURVATURE_TIME * frames
         found = np.square(columns) @ variances
-        if tick.landmark_std is not None:
-            of_landmark = measured.targets < len(tick.landmark_std)
-            std = np.where(of_landmark & (measured.targets >= 0), tick.landmark_std[measured.targets * of_landmark], 0.0)
+        if tick.landmark_std:
+            of_landmark = (measured.targets >= 0) & (measured.targets < len(tick.landmark_std))
+            std = np.where(of_landmark, np.array(tick.landmark_std)[measured.targets * of_landmark], 0.0)
             found += frames * std[:, None] ** 2 * np.sum(by_place**2, axis=-1)
         return np.asarray(found)

@@ -92,11 +92,10 @@ class ConsiderFilter(Mekf):
         self.from_marker = adjoint(np.eye(3), marker)
         self.landmarks = setup.landmarks
         self.lasting = LastingErrors(setup, self.estimated)
-        map_std = np.zeros(self.landmarks) if setup.landmark_std is None else np.asarray(setup.landmark_std, float)
         self.map_covariances = {
-            int(n): np.diag([*[LEAST_VARIANCE] * 3, *[map_std[n] ** 2] * 3])
-            for n in np.flatnonzero(map_std)
-            if n in setup.targets
+            n: np.diag([*[LEAST_VARIANCE] * 3, *[std**2] * 3])
+            for n, std in enumerate(setup.landmark_std)
+            if std > 0.0 and n in setup.targets
         }
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:

@@ -10,9 +10,10 @@ from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError, is_of_user
 from coopenv.episode import RECORDED, Episode, Origin, Views
 from coopenv.evaluation.episodes import play
+from coopenv.observers.arrays import recorded_names
 from coopenv.observers.faults import Interference, interference_of, stacked
 from coopenv.observers.recording import Drawn, Recording
-from coopenv.observers.sensed import Sensed, Truth, is_due
+from coopenv.observers.sensed import MEASURED, Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
 from coopenv.scenario import ScenarioLike
 from coopenv.sources.base import Backend
@@ -92,7 +93,8 @@ def record_episode(
             raise
         on_failure(error)
     L, observer_init = len(scenario.landmarks), engine.world.observer_init
-    kept: dict[str, Any] = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in ticks[0].measured()}
+    names = [name for name in recorded_names(scenario) if name in MEASURED]
+    kept: dict[str, Any] = {name: np.stack([tick.filled(name) for tick in ticks]) for name in names}
     episode = views.episode(scenario, source_of(engine, name, seed, policy if isinstance(policy, str) else "custom"))
     recording = Recording(
         setups=observer_init.setups,

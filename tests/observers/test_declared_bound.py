@@ -45,7 +45,7 @@ def declaring(made: Recording) -> Recording:
     """Return a record of moving landmarks in which all errors are declared, those of the map with one exact one."""
     L = made.landmarks.shape[1]
     accuracy = np.where(np.arange(L) == 1, 0.0, MAP * (1.0 + np.arange(L)))
-    setups = tuple(replace(s, noise=replace(s.noise, **STD), landmark_std=accuracy) for s in made.setups)
+    setups = tuple(replace(s, noise=replace(s.noise, **STD), landmark_std=tuple(accuracy)) for s in made.setups)
     drift = made.t[:, None, None] * np.array([0.3, -0.2, 0.1])
     return replace(made, setups=setups, landmarks=made.landmarks + drift)
 
@@ -144,7 +144,7 @@ def test_a_vehicle_without_ancestors_has_the_bound_of_its_own_measurements() -> 
 def test_every_declared_error_raises_the_bound(error: str) -> None:
     made = small_record(8)
     if error == "landmark_std":
-        setups = tuple(replace(s, landmark_std=np.full(made.landmarks.shape[1], MAP)) for s in made.setups)
+        setups = tuple(replace(s, landmark_std=(MAP,) * made.landmarks.shape[1]) for s in made.setups)
     else:
         setups = tuple(replace(s, noise=replace(s.noise, **{error: 0.05})) for s in made.setups)
     plain, more = cramer_rao(made), cramer_rao(replace(made, setups=setups))
