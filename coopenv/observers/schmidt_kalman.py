@@ -19,6 +19,11 @@ are corrected, the others are considered, too. So are the errors of the map: a l
 neighbour that does not move, whose error is the same for all vehicles. Its cross-covariance with a neighbour is the one
 that the neighbour has sent.
 
+Two neighbours of which neither has sent their cross-covariance count as independent given the others in view that both
+correlate with: C_ab = C_aS P_SS^-1 C_Sb. That is the covariance of largest entropy with the known blocks. Source:
+Dempster, Covariance selection, Biometrics 28(1), 1972. Zeros would state that errors with a common cause are
+independent.
+
 In that work a measurement corrects both vehicles, which exchange covariances and factors both ways. Here messages are
 broadcast, and the target of a bearing does not receive it: j is considered, and only i is corrected. The product
 Sigma_ij is kept by i and propagated by j's factor.
@@ -43,7 +48,7 @@ from coopenv.estimation.compiled import (
     place,
     product,
 )
-from coopenv.estimation.poses import Array, cholesky
+from coopenv.estimation.poses import Array, cholesky, solve
 from coopenv.observers.contract import Message, Setup, Tick
 from coopenv.observers.correction import (
     CONSTANTS,
@@ -55,7 +60,7 @@ from coopenv.observers.correction import (
     judged_frame,
 )
 from coopenv.observers.frame import FRAME, Frame, UsableMeasurements
-from coopenv.observers.lasting_errors import LastingErrors
+from coopenv.observers.lasting_errors import EVERY, LastingErrors
 from coopenv.observers.pose_filters import Mekf
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, moved, predicted, recentring, transition
 
@@ -253,7 +258,29 @@ class ConsiderFilter(Mekf):
             if between is not None and n:
                 joint[k, own : k.start] = between[n, :n].transpose(1, 0, 2).reshape(6, -1)
                 joint[own : k.start, k] = joint[k, own : k.start].T
+        if between is not None and len(seen) > 2:
+            complete(joint, own, [target < self.landmarks for target in seen])
         return joint
+
+
+def complete(joint: Array, own: int, still: Sequence[bool]) -> None:
+    """Fill in the cross-covariances of two neighbours that are zero, by the others.
+
+    Args:
+        joint: (n + 6k, n + 6k) covariance of the own error and those of k neighbours; changed in place.
+        own: n.
+        still: (k,) which neighbours are landmarks; the errors of two landmarks are independent.
+    """
+    at = [slice(k, k + 6) for k in range(own, len(joint), 6)]
+    known = joint[own:, own:].reshape(len(at), 6, len(at), 6).any(axis=(1, 3))
+    for a in range(len(at)):
+        for b in range(a):
+            between = np.flatnonzero(known[a] & known[b])
+            if known[a, b] or not len(between) or (still[a] and still[b]):
+                continue
+            S = np.concatenate([np.arange(at[c].start, at[c].stop) for c in between])
+            joint[at[a], at[b]] = joint[at[a], S].dot(solve(joint[np.ix_(S, S)], joint[S, at[b]]))
+            joint[at[b], at[a]] = joint[at[a], at[b]].T
 
 
 def made_definite(joint: Array, own: int) -> Array:
@@ -342,7 +369,7 @@ def _has_factor(P: Array) -> bool:
 
 
 class SchmidtKalman(ConsiderFilter):
-    """Considers neighbours with cross-covariances.
+    """Considers neighbours with cross-covariances, lasting errors and the map.
 
     It sends its pose with covariance, its factor, and the cross-covariances that it keeps.
     """
@@ -383,6 +410,15 @@ def sent_cross_covariance(message: Message | None, target: int) -> Array:
     if targets.ndim != 1 or cross.shape != (len(targets), 6, 6) or target not in (numbers := targets.tolist()):
         return np.zeros((6, 6))
     return np.asarray(cross[numbers.index(target)])
+
+
+class SchmidtCalibrating(SchmidtKalman):
+    """Schmidt filter that also estimates the lasting errors of its odometry and sensors.
+
+    It sends what `schmidt_kalman` sends.
+    """
+
+    estimated = EVERY
 
 
 class Pairwise(ConsiderFilter):
