@@ -104,6 +104,9 @@ class Mekf(PoseObserver):
         self.nis_dof = 0
         measured = usable_measurements(tick, self.sends_covariance) if tick.due else None
         if measured is not None:
+            if self.counts_errors:
+                variances = self.lasting.counted(tick, linearised(self.state._replace(kind=LEFT), measured))
+                measured.entries["curvature"][:, : variances.shape[1]] += variances
             self.take(tick, measured)
         return self.state.estimate(self.nis, self.nis_dof)
 
@@ -116,9 +119,6 @@ class Mekf(PoseObserver):
         """Correct by the bearings that pass the gate."""
         if len(measured.sensors) > 1:
             self.add_curvature(tick, measured)
-        if self.counts_errors:
-            variances = self.lasting.counted(tick, linearised(self.state._replace(kind=LEFT), measured))
-            measured.entries["curvature"][:, : variances.shape[1]] += variances
         if self.gated:
             kept = self.gate.passed(tick.time, self.judged(measured))
             if not kept.all():
@@ -136,7 +136,7 @@ class Mekf(PoseObserver):
         linear, axes, line = linearised(self.state, measured), measured.axes, measured.positions - self.state.p
         G = linear.by_target[..., 3:] @ axes.swapaxes(1, 2)
         found = curvature(G, linear.angle, line, self.covariances_of_lines(measured, axes), frames)
-        measured.entries["curvature"][:, : found.shape[1]] = found
+        measured.entries["curvature"][:, : found.shape[1]] += found
 
     def covariances_of_lines(self, measured: UsableMeasurements, axes: Array) -> Array:
         """Return (m, 3, 3) the covariances of the lines from the vehicle to its targets, map axes, m^2."""

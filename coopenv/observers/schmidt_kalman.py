@@ -279,7 +279,7 @@ def complete(joint: Array, own: int, still: Sequence[bool]) -> None:
             if known[a, b] or not len(between) or (still[a] and still[b]):
                 continue
             S = np.concatenate([np.arange(at[c].start, at[c].stop) for c in between])
-            joint[at[a], at[b]] = joint[at[a], S].dot(solve(joint[np.ix_(S, S)], joint[S, at[b]]))
+            joint[at[a], at[b]] = joint[at[a], S].dot(solve(made_definite(joint[np.ix_(S, S)], 6), joint[S, at[b]]))
             joint[at[b], at[a]] = joint[at[a], at[b]].T
 
 
