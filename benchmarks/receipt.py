@@ -1,12 +1,13 @@
 """`python -m benchmarks.receipt`: what each part of `robust` buys, and how much its numbers matter.
 
-Without arguments it leaves out one part after the other, and all monitors together. Columns of the table in Markdown:
+Without arguments it leaves out one part after the other, and all monitors together; then follow other observers, which
+have no monitors. Columns of the table in Markdown:
 false exclusions per hour of a vehicle in worlds without a fault; median time from a lie to the exclusion of its sender;
 median CPU time of an update, us; mean position RMSE of honest vehicles by case, m. With `--without` it leaves out the
-given parts, or several together, as in `--without "readmission + prior"`. With `--constants` it halves and doubles each
-constant that follows from no other one; those that follow from it change with it. Every variant runs in a process of
-its own, in which functions or constants are replaced before compilation, which takes half a minute per variant, once
-per machine.
+given parts, or several together, as in `--without "readmission + prior"`, or measures the given observers. With
+`--constants` it halves and doubles each constant that follows from no other one; those that follow from it change with
+it. Every variant runs in a process of its own, in which functions or constants are replaced before compilation, which
+takes half a minute per variant, once per machine.
 """
 
 from __future__ import annotations
@@ -44,6 +45,9 @@ LIES = {
 TRACKING_CASES = (*CASES, "passing", "large bias", "scale", "swapped", *LIES)
 ROAD_CASES = (*CASES, "focal length", "prior")
 """In the first scene; passing: a landmark that is wrong for 4 s. In the second one: `ROAD_CASES`."""
+
+RIVALS = ("schmidt_kalman_individual", "schmidt_kalman", "self_calibrating")
+"""Observers beside `robust`: a gate of each measurement, a joint gate, and lasting errors as states."""
 
 
 def parts() -> dict[str, list[tuple[Any, str, Any]]]:
@@ -191,28 +195,30 @@ def leave_out(variant: str) -> None:
 
 
 def measure(variant: str, seeds: Sequence[int]) -> dict[str, Any]:
-    """Return the values by case of every seed, with a part left out or a constant changed."""
-    leave_out(variant)
+    """Return the values by case of every seed, with a part left out or a constant changed, or of another observer."""
+    if variant not in RIVALS:
+        leave_out(variant)
     from benchmarks import evidence
+    from coopenv.observers.registry import find
     from coopenv.runs import record
 
+    factory = find(variant if variant in RIVALS else "robust")
     found: dict[str, Any] = {"exclusions": 0.0, "hours": 0.0, "delay": [], "microseconds": [], "rmse": {}}
     for scene, made in (("tracking", evidence.tracking()), ("road", evidence.road())):
         for seed in seeds:
             recording = record(made, seed)
             for case in TRACKING_CASES if scene == "tracking" else ROAD_CASES:
-                add_case(found, scene, case, recording, seed)
+                add_case(found, scene, case, recording, seed, factory)
     return found
 
 
-def add_case(found: dict[str, Any], scene: str, case: str, recording: Any, seed: int) -> None:
+def add_case(found: dict[str, Any], scene: str, case: str, recording: Any, seed: int, factory: Any) -> None:
     """Run the observers on a changed recording, and add what they show to the values found."""
     from benchmarks import evidence
     from coopenv.observers import run
-    from coopenv.observers.robust.observer import robust
 
     names = [setup.name for setup in recording.setups]
-    watched = [Watched(robust(setup)) for setup in recording.setups]
+    watched = [Watched(factory(setup), setup) for setup in recording.setups]
     changed = change_of(case)(recording, seed)
     result = run(lambda setup: watched[names.index(setup.name)], changed)
     if result.failure:
@@ -258,10 +264,11 @@ def passing(recording: Any, seed: int) -> Any:
 
 
 class Watched:
-    """An observer of which the times of exclusions are noted."""
+    """An observer of which the times of exclusions are noted, if it has monitors."""
 
-    def __init__(self, observer: Any) -> None:
-        self.observer, self._known = observer, np.zeros(len(observer.memory.source), int)
+    def __init__(self, observer: Any, setup: Any) -> None:
+        self.observer, self.targets = observer, setup.targets
+        self._known = self._exclusions()
         self.times: list[tuple[float, int]] = []
         self.seconds: list[float] = []  # CPU time of each update
 
@@ -270,17 +277,21 @@ class Watched:
 
     def sees(self, target: int) -> bool:
         """Return whether a target is a neighbour of the vehicle."""
-        return target in self.observer.setup.targets
+        return target in self.targets
+
+    def _exclusions(self) -> np.ndarray:
+        memory = getattr(self.observer, "memory", None)
+        return np.zeros(0, int) if memory is None else memory.source["exclusions"].copy()
 
     def update(self, tick: Any) -> Any:
         """Take a tick, and note what has been excluded."""
         begin = process_time()
         estimate = self.observer.update(tick)
         self.seconds.append(process_time() - begin)
-        source = self.observer.memory.source
-        for q in np.flatnonzero(source["exclusions"] > self._known):
-            self.times.append((float(tick.time), int(source["target"][q])))
-        self._known = source["exclusions"].copy()
+        exclusions = self._exclusions()
+        for q in np.flatnonzero(exclusions > self._known):
+            self.times.append((float(tick.time), int(self.observer.memory.source["target"][q])))
+        self._known = exclusions
         return estimate
 
 
@@ -353,9 +364,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if asked.variant:
         print(json.dumps(measure(asked.variant, seeds)))
         return 0
-    variants = ["nothing", *asked.without] if asked.without else list(parts())
+    variants = ["nothing", *asked.without] if asked.without else [*parts(), *RIVALS]
     try:
-        for variant in variants:
+        for variant in (name for name in variants if name not in RIVALS):
             changes_of(variant)
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)

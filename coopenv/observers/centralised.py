@@ -118,7 +118,7 @@ class Centralised:
         before, P = self.poses, self.P
         linear = {i: self.linearise(i, of) for i, of in measured.items()}
         kept = {
-            i: self.gates[i].passed(ticks[i].time, judged(of.residual, spread(of.H, P, of.N), *of[5:8]))
+            i: self.gates[i].passed(ticks[i].time, judged(of.residual, spread(of.H, P, of.N), *of[4:8]))
             for i, of in linear.items()
         }
         residual, H, N = _stacked([of.only(kept[i]) for i, of in linear.items()])

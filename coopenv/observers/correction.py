@@ -21,8 +21,9 @@ bearings would be rejected. Occasional wrong associations do not open it, nor do
 While the gate is open, a faulty message is fused.
 """
 
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
@@ -43,6 +44,7 @@ from coopenv.estimation.compiled import (
 from coopenv.estimation.poses import Array, solve
 from coopenv.measurements.kinds import MOST_ROWS, unit
 from coopenv.observers.frame import FRAME, Frame, UsableMeasurements
+from coopenv.observers.guard import MOST_DEVIATIONS
 from coopenv.observers.linearisation import (
     FLAG_ROWS,
     FLAGS,
@@ -165,6 +167,7 @@ def curvature(G: Array, angle: NDArray[np.bool_], line: Array, V: Array, frames:
     return np.asarray(frames[:, None] * variances / distance**2)
 
 
+RISK = 1e-3  # that a correct measurement is refused
 LARGEST = 13.8155  # 0.999 of a chi-square of 2: -2 log 0.001
 LARGEST_OF = np.array([LARGEST, 10.828, LARGEST, 16.266, 18.467, 20.515, 22.458])
 """The same of as many degrees of freedom; a measurement without any row fits."""
@@ -175,9 +178,18 @@ OPENING_SHARE, CLOSING_SHARE = 0.6, 0.1
 of two does not open the gate; one of three keeps it open."""
 
 
-Judgement = tuple[NDArray[np.bool_], NDArray[np.bool_], float, float]
-"""(m,) which S are covariances, (m,) which measurements fit, the share of the others, and the largest trace, rad^2, of
-the rows that measure an angle."""
+SECOND_ORDER = 0.75
+"""Largest mean square of half the square of a normal error, over its squared variance: that of one axis."""
+
+
+class Judgement(NamedTuple):
+    """How the measurements of a frame are judged at a prediction."""
+
+    definite: NDArray[np.bool_]  # (m,) which S are covariances
+    fits: NDArray[np.bool_]  # (m,) which measurements fit
+    rejected: float  # share of the others
+    widest: float  # largest trace, rad^2, of the rows of S that measure an angle
+    innovations: Array  # (m, 3, r) as the guard takes them, second-order errors included
 
 
 class InnovationGate:
@@ -187,6 +199,7 @@ class InnovationGate:
         self.share = 0.0  # of rejected bearings, averaged
         self.is_open = False
         self.time = 0.0  # s, of the last frame
+        self.weight = 0.0  # in the share, of one bearing of it
 
     def passed(self, time: float, judgement: Judgement) -> NDArray[np.bool_]:
         """Return (m,) which measurements of a frame are accepted; a measurement with an invalid S never is.
@@ -195,8 +208,10 @@ class InnovationGate:
             time: s.
             judgement: of the frame.
         """
-        definite, fits, rejected, widest = judgement
-        self.share += (rejected - self.share) * min(1.0, max(0.0, time - self.time) / AVERAGING)
+        definite, fits, rejected, widest = judgement[:4]
+        weight = min(1.0, max(0.0, time - self.time) / AVERAGING)
+        self.share += (rejected - self.share) * weight
+        self.weight = weight / len(fits)
         if widest > WIDE:
             self.share = 1.0
         self.time = time
@@ -204,14 +219,24 @@ class InnovationGate:
         taken: NDArray[np.bool_] = definite if self.is_open else fits
         return taken
 
+    def refuse(self, count: int) -> None:
+        """Count so many accepted measurements of the last frame as rejected."""
+        self.share += count * self.weight
 
-@compiled(MATRIX, MATRICES, FLAG_ROWS, FLAG_ROWS, FLAGS)
+
+@compiled(MATRIX, MATRICES, MATRIX, FLAG_ROWS, FLAG_ROWS, FLAGS)
 def judged(
-    residual: Array, S: Array, used: NDArray[np.bool_], angle: NDArray[np.bool_], ahead: NDArray[np.bool_]
+    residual: Array,
+    S: Array,
+    variance: Array,
+    used: NDArray[np.bool_],
+    angle: NDArray[np.bool_],
+    ahead: NDArray[np.bool_],
 ) -> Judgement:
     """Return how measurements with covariances S (m, r, r) are judged; arguments as for `LinearMeasurements`."""
     squared, widest = normalised(residual, S), 0.0
     definite, fits = np.empty(len(S), np.bool_), np.empty(len(S), np.bool_)
+    innovations = np.zeros((len(S), 3, residual.shape[1]))
     for n in range(len(S)):
         dof, trace = np.count_nonzero(used[n]), 0.0
         for k in range(residual.shape[1]):
@@ -219,7 +244,13 @@ def judged(
         definite[n] = squared[n] >= 0.0 and dof > 0
         fits[n] = definite[n] and squared[n] <= LARGEST_OF[dof] and ahead[n]
         widest = max(widest, trace)
-    return definite, fits, 1.0 - np.count_nonzero(fits) / len(fits), widest
+        for k in range(residual.shape[1]):
+            if used[n, k] and definite[n]:
+                of_row = S[n, k, k] + (SECOND_ORDER * trace * trace if angle[n, k] else 0.0)
+                innovations[n, 0, k] = min(max(residual[n, k] / math.sqrt(of_row), -MOST_DEVIATIONS), MOST_DEVIATIONS)
+                innovations[n, 1, k] = min(variance[n, k] / of_row, 1.0)
+                innovations[n, 2, k] = math.sqrt(1.0 - innovations[n, 1, k])
+    return Judgement(definite, fits, 1.0 - np.count_nonzero(fits) / len(fits), widest, innovations)
 
 
 PLACES = types.Array(types.int64, 1, "A", readonly=True)
@@ -358,14 +389,14 @@ def judged_frame(
     P (n, n) is the covariance of the own error and of constants, and `crosses` (k, n, 6) are its covariances with the
     errors of some neighbours. The other arguments are those of `halfway_gain`.
     """
-    residual, H, N, by_target, _, used, angle, ahead = linearise(R, p, kind == RIGHT, frame)
+    residual, H, N, by_target, variance, used, angle, ahead = linearise(R, p, kind == RIGHT, frame)
     whole = joint_jacobian(residual, H, by_target, used, frame, np.eye(6), constants, np.zeros(0, np.int64), 0)
     S = spread(whole, P, N)
     for n in range(len(places)):
         if places[n] >= 0:
             common = product(product(whole[n], crosses[places[n]]), by_target[n].T)
             place(S[n], 0, 0, S[n] + common + common.T)
-    return judged(residual, S, used, angle, ahead)
+    return judged(residual, S, variance, used, angle, ahead)
 
 
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)

@@ -31,6 +31,7 @@ from coopenv.observers.correction import (
     updated,
 )
 from coopenv.observers.frame import CAMERA, FRAME, Frame, UsableMeasurements, usable_measurements
+from coopenv.observers.guard import Guard
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.lasting_errors import LastingErrors
 from coopenv.observers.linearisation import LinearMeasurements, across, dense, linearised, normalised
@@ -56,13 +57,18 @@ class PoseObserver:
         """Start at a pose."""
         self.state = UncertainPose.start(self.kind, *initial_pose, initial_covariance)
 
+    @property
+    def stated(self) -> UncertainPose:
+        """The estimate as it is stated and broadcast."""
+        return self.state
+
     def message(self) -> Message:
         """Return the marker's position, its covariance if this observer sends it, and what sensors need beside."""
         position = self.state.p + self.state.R.dot(self.marker)
         if "rotation" in self.needed:
-            covariance = self.state.marker_covariance(self.marker) if self.sends_covariance else None
+            covariance = self.stated.marker_covariance(self.marker) if self.sends_covariance else None
             return Message(position, self.state.R, covariance, self.extra())
-        covariance = self.state.point_covariance(self.marker) if self.sends_covariance else None
+        covariance = self.stated.point_covariance(self.marker) if self.sends_covariance else None
         return Message(position=position, covariance=covariance, extra=self.extra())
 
     def extra(self) -> dict[str, Array]:
@@ -81,6 +87,7 @@ class Mekf(PoseObserver):
 
     sends_covariance = False
     gated = True  # else every bearing is used
+    guarded = False  # whether a guard multiplies the covariance that is stated and broadcast
     counts_errors = True  # whether declared errors of sensors and map count as noise
 
     def __init__(self, setup: Setup) -> None:
@@ -91,7 +98,7 @@ class Mekf(PoseObserver):
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
         super().reset(initial_pose, initial_covariance)
-        self.gate = InnovationGate()
+        self.gate, self.guard = InnovationGate(), Guard()
         self.lasting.reset()
         self.measured: dict[int, float] = {}  # s, time of the last measurement of each sensor beside the camera
 
@@ -108,7 +115,13 @@ class Mekf(PoseObserver):
                 variances = self.lasting.counted(tick, linearised(self.state._replace(kind=LEFT), measured))
                 measured.entries["curvature"][:, : variances.shape[1]] += variances
             self.take(tick, measured)
-        return self.state.estimate(self.nis, self.nis_dof)
+        return self.stated.estimate(self.nis, self.nis_dof)
+
+    @property
+    def stated(self) -> UncertainPose:
+        """The estimate as it is stated and broadcast: the covariance has the factor of the guard."""
+        factor = self.guard.factor
+        return self.state if factor == 1.0 else self.state._replace(P=factor * self.state.P)
 
     def predict(self, tick: Tick) -> None:
         """Append the increment."""
@@ -120,7 +133,12 @@ class Mekf(PoseObserver):
         if len(measured.sensors) > 1:
             self.add_curvature(tick, measured)
         if self.gated:
-            kept = self.gate.passed(tick.time, self.judged(measured))
+            judgement = self.judged(measured)
+            kept = self.gate.passed(tick.time, judgement)
+            if self.guarded:
+                last = (measured.targets >= len(tick.landmarks)) | (measured.entries["covariance"][:, 3, 3] > 0.0)
+                last |= self.lasting.estimated < len(self.lasting.states)
+                self.guard.add(tick.time, measured.targets, judgement.innovations, last)
             if not kept.all():
                 measured = measured.only(kept)
         if len(measured.entries):
@@ -248,7 +266,7 @@ class Ukf(MekfCovariance):
         if self.gated:
             each, rows = np.arange(len(measured.entries)), linear.residual.shape[1]
             blocks = S.reshape(len(each), rows, len(each), rows)[each, :, each, :]
-            judgement = judged(r.reshape(-1, rows), blocks, linear.used, linear.angle, linear.ahead)
+            judgement = judged(r.reshape(-1, rows), blocks, *linear[4:8])
             fits = self.gate.passed(tick.time, judgement)
             kept, linear = fits.repeat(rows), linear.only(fits)
             if not kept.any():

@@ -60,6 +60,7 @@ from coopenv.observers.correction import (
     judged_frame,
 )
 from coopenv.observers.frame import FRAME, Frame, UsableMeasurements
+from coopenv.observers.joint_gate import fitting_together, innovation, largest_of
 from coopenv.observers.lasting_errors import EVERY, LastingErrors
 from coopenv.observers.pose_filters import Mekf
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, moved, predicted, recentring, transition
@@ -87,6 +88,8 @@ class ConsiderFilter(Mekf):
     """
 
     sends_covariance = True
+    guarded = True
+    jointly = True  # whether measurements of a frame must also fit together
     counts_errors = False
     estimated: ClassVar[Collection[str]] = ()
 
@@ -132,7 +135,7 @@ class ConsiderFilter(Mekf):
         self.factor, self.number = self.identity, self.number + 1
         extra = {"factor": factor, "number": np.array([self.number]), **self.extra()}
         position = self.state.p + self.state.R.dot(self.marker)
-        return Message(position, self.state.R, T.dot(self.state.P).dot(T.T), extra)
+        return Message(position, self.state.R, T.dot(self.stated.P).dot(T.T), extra)
 
     def predict(self, tick: Tick) -> None:
         """Append the increment without its lasting errors."""
@@ -209,7 +212,13 @@ class ConsiderFilter(Mekf):
         seen, places = self.places(measured)
         of, own = [self.neighbours[t] for t in seen], len(self.P)
         joint = made_definite(self.joint_covariance(seen, between), own)
-        R, p, P, change, remaining, crosses, nis, dof = self.considered(joint, measured.exact().frame, places)
+        frame = measured.exact().frame
+        made = self.considered(joint, frame, places)
+        if self.jointly and not self.gate.is_open and made[6] > largest_of(made[7]):
+            kept = fitting_together(*innovation(*self.state[1:3], joint, frame, self.constants, places), len(places))
+            self.gate.refuse(int((~kept).sum()))
+            made = self.considered(joint, (frame[0][kept], *frame[1:]), places[kept])
+        R, p, P, change, remaining, crosses, nis, dof = made
         carried = factor_of(joint, remaining)
         for n, target in enumerate(self.unseen(seen), len(seen)):
             number, variances, cross = self.neighbours[target]
@@ -400,6 +409,15 @@ class SchmidtKalman(ConsiderFilter):
     def between(by_one: Array, by_other: Array) -> Array:
         """Return the cross-covariance (6, 6) of two neighbours from what the two have sent; one of them knows it."""
         return by_one + by_other.T
+
+
+class SchmidtKalmanIndividual(SchmidtKalman):
+    """Considers neighbours, and tests each measurement alone.
+
+    It is `schmidt_kalman` without the joint gate and without the guard of its covariance.
+    """
+
+    guarded = jointly = False
 
 
 def sent_cross_covariance(message: Message | None, target: int) -> Array:

@@ -74,7 +74,9 @@ class SelfCalibrating(SchmidtKalman):
         report = super().message()
         by_pose = np.linalg.solve(self.P[:6, :6], self.P[:6]).T
         recent = [*self.since.items()][1 - REMEMBERED :]
-        self.since = {**dict(recent), self.number: by_pose.dot(self.from_marker)}
+        self.since = dict(recent)
+        if self.guard.factor == 1.0:  # otherwise corrections are of a larger covariance than the own one
+            self.since[self.number] = by_pose.dot(self.from_marker)
         numbers = np.array([self.neighbours[t].number for t in sorted(self.neighbours)], float)
         made = [[target, one[0], *one[1], *one[2].ravel()] for target, one in self.corrections.items()]
         self.corrections = {}

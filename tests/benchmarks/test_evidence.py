@@ -19,6 +19,7 @@ from coopenv.bench.observers.faults import variant_of
 from coopenv.mrclam.recording import LEAD_S, WHEELS, recording_of
 from coopenv.observers import run
 from coopenv.observers.recording import Recording
+from coopenv.observers.registry import list_observers
 from coopenv.observers.robust import constants
 from coopenv.runs import record
 from coopenv.scenario import load_scenario
@@ -219,9 +220,20 @@ def test_exclusions_are_noted_with_their_time_and_target() -> None:
         return float(tick.time)
 
     setup = SimpleNamespace(targets=np.array([3, 7]))
-    watched = receipt.Watched(SimpleNamespace(memory=SimpleNamespace(source=source), setup=setup, update=update))
+    watched = receipt.Watched(SimpleNamespace(memory=SimpleNamespace(source=source), update=update), setup)
     assert [watched.update(SimpleNamespace(time=t)) for t in (1.0, 2.0, 3.0)] == [1.0, 2.0, 3.0]
     assert watched.times == [(2.0, 7)] and len(watched.seconds) == 3 and watched.sees(7) and not watched.sees(4)
+
+
+def test_an_observer_without_monitors_excludes_nothing() -> None:
+    watched = receipt.Watched(SimpleNamespace(update=lambda tick: tick.time), SimpleNamespace(targets=np.array([3])))
+    assert watched.update(SimpleNamespace(time=1.0)) == 1.0
+    assert watched.times == [] and watched.sees(3)
+
+
+def test_the_rivals_are_observers_of_the_zoo() -> None:
+    assert {*receipt.RIVALS} <= {*list_observers()}
+    assert not {*receipt.RIVALS} & {*receipt.parts()}
 
 
 @pytest.mark.parametrize(

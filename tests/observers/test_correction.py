@@ -181,7 +181,7 @@ def passed(gate: InnovationGate, time: float, *sizes: float, ahead: np.ndarray =
 def judgement_of(residual: np.ndarray, S: np.ndarray, ahead: np.ndarray) -> Judgement:
     """Return how bearings with residuals (m, 2) are judged."""
     every = np.ones(residual.shape, bool)
-    return judged(residual, S, every, every, ahead)
+    return judged(residual, S, np.full(residual.shape, 1e-4), every, every, ahead)
 
 
 def test_the_gate_refuses_one_honest_bearing_of_a_thousand() -> None:

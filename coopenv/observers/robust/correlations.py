@@ -31,7 +31,7 @@ from coopenv.observers.robust.memory import (
     vec3d,
 )
 from coopenv.observers.robust.messages import dependents, depends_on_own, own_report
-from coopenv.observers.robust.sources import is_excluded
+from coopenv.observers.robust.sources import guarded_covariance, is_excluded
 from coopenv.world.nearby import agent_of, box_of, box_of_entry, entry_at, entry_count, is_target
 from coopenv.world.v2x import content_tick
 from coopenv.world.warp_internals import device_function, subroutine
@@ -74,7 +74,7 @@ def next_broadcast(model: Any, memory: Any, world: int, i: int, last: int) -> in
 @subroutine
 def own_correlation(model: Any, memory: Any, world: int, i: int, n: int):
     """Return the correlation, 6x6 in whole steps, of the vehicle's left error at its marker with that of a member."""
-    P = memory.P[world, i, 0, 0] + memory.fault_mixture[world, i]
+    P = guarded_covariance(memory, world, i)
     C = memory.P[world, i, 0, n]
     marker = vec3d(model.scene.marker[model.landmarks + i])
     if wp.length_sq(marker) > wp.float64(0.0):

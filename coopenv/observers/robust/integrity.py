@@ -31,6 +31,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import block3
+from coopenv.observers.guard import UNKNOWN
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import KNOWN_ANGLE_VARIANCE, KNOWN_POSITION_VARIANCE, diagonal_by_rows
 from coopenv.observers.robust.memory import (
@@ -53,6 +54,8 @@ from coopenv.observers.robust.sources import (
     VELOCITY,
     clear_drift,
     clear_source,
+    guard_factor,
+    guarded_covariance,
     is_active,
     is_own,
     is_rejected,
@@ -391,9 +394,14 @@ def levels(up: Any, variances: Any, mean: Any):
 
 @subroutine
 def protection_level(memory: Any, world: int, i: int):
-    """Return (2,) the horizontal, m, and the angular, rad, protection level; infinite: unknown."""
+    """Return (2,) the horizontal, m, and the angular, rad, protection level; infinite: unknown.
+
+    Late frames of all vehicles agree with each other and with odometry, so that no innovation shows them.
+    """
     up = wp.transpose(memory.member[world, i, 0].pose.R) * vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))
-    own = own_variances(up, memory.P[world, i, 0, 0] + memory.fault_mixture[world, i])
+    if guard_factor(memory, world, i) > wp.float64(UNKNOWN):
+        return vec2d(wp.float64(wp.inf))
+    own = own_variances(up, guarded_covariance(memory, world, i))
     most = levels(up, own, vec6d())
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
@@ -408,4 +416,5 @@ def protection_level(memory: Any, world: int, i: int):
             ):
                 return vec2d(wp.float64(wp.inf))
             most = wp.max(most, levels(up, variances, Phi * memory.source[world, i, q].offset))
+    most[0] += wp.float64(constants.UNDECLARED_LATENCY) * wp.length(memory.belief[world, i].mean_v)
     return most

@@ -39,7 +39,7 @@ from coopenv.observers.robust.memory import (
     vec4d,
     vec6d,
 )
-from coopenv.observers.robust.sources import VELOCITY, is_seen, propagate_sources
+from coopenv.observers.robust.sources import VELOCITY, guarded_covariance, is_seen, propagate_sources
 from coopenv.world.nearby import agent_of, entry_at, entry_count
 from coopenv.world.warp_internals import device_function, subroutine
 
@@ -84,8 +84,8 @@ def own_estimate(memory: Any, world: int, i: int):
 
 @device_function
 def estimate_with_faults(memory: Any, world: int, i: int):
-    """Return the own estimate with a covariance that includes the mixture of likely faults."""
-    return PoseEstimate(memory.member[world, i, 0].pose, memory.P[world, i, 0, 0] + memory.fault_mixture[world, i])
+    """Return the own estimate with the covariance that is stated."""
+    return PoseEstimate(memory.member[world, i, 0].pose, guarded_covariance(memory, world, i))
 
 
 @subroutine

@@ -77,6 +77,26 @@ class Member:
 
 
 @wp.struct
+class BlockSums:
+    """Sums over the present blocks of the guard, by length of a block and row of a bearing, see guard.py."""
+
+    innovation: mat22d  # over standard deviations
+    white: mat22d  # shares of the bearings' noise in the variances
+    lasting: mat22d  # roots of the other shares, if these are a sender's
+
+
+@wp.struct
+class GuardTotals:
+    """Decaying totals of the guard by length of a block, see guard.py."""
+
+    time: vec2d  # s since the present block began
+    squared: vec2d  # sums over their variances
+    expected: vec2d
+    freedom: vec2d  # degrees of freedom
+    factor: wp.float64  # on the covariance that is stated and broadcast; 0: none yet
+
+
+@wp.struct
 class SourceMonitor:
     """A source of information and the monitor of its fault f, see integrity.py."""
 
@@ -99,6 +119,7 @@ class SourceMonitor:
     drift_time: wp.float64  # s for which it has been likely; of an excluded source, for which it drifted, 0: it did not
     time: wp.float64  # s for which it has been excluded and in view; of the velocity, since its last fault
     walk: wp.float64  # variance that the odometry's scale gains in a second, because the velocity's fault has returned
+    guard: BlockSums
 
 
 @wp.struct
@@ -120,6 +141,7 @@ class JointBelief:
     gate_disabled_time: wp.float64  # s for which they have counted
     block_time: wp.float64  # s since the monitors' present block began
     news_interval: wp.int32  # of `NEWS_TIME`, the last with a report that carries correlations, from 1 on
+    guard: GuardTotals
 
 
 @wp.struct
@@ -394,7 +416,9 @@ def robust_rules() -> dict[str, Rule]:
     large = (
         "hypothesis.cost hypothesis.misfit hypothesis.prior_distance fault_mixture sensitivity information "
         "drift_effect source.drift source.drift_vector source.drift_information source.drift_ratio source.drift_time "
-        "source.walk source.vector source.ratio source.sum source.information source.covariance source.offset"
+        "source.walk source.vector source.ratio source.sum source.information source.covariance source.offset "
+        "source.guard.innovation source.guard.white source.guard.lasting belief.guard.time belief.guard.squared "
+        "belief.guard.expected belief.guard.freedom belief.guard.factor"
     )
     rules = {
         **dict.fromkeys(flags.split(), FLAG),

@@ -23,6 +23,7 @@ from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.constants import MAX_CORRELATIONS, MIN_VARIANCE, STEPS
 from coopenv.observers.robust.joint_state import propagate
 from coopenv.observers.robust.memory import Pose, SenderReport, mat66f, vec3d
+from coopenv.observers.robust.sources import guarded_covariance
 from coopenv.world.embedded import Messages
 from coopenv.world.v2x import as_broadcast, claimed_std, odometry_as_broadcast
 from coopenv.world.warp_internals import device_function, subroutine
@@ -48,7 +49,7 @@ def own_report(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
     """
     report = SenderReport()
     report.tick = tick
-    P = memory.P[world, i, 0, 0] + memory.fault_mixture[world, i]
+    P = guarded_covariance(memory, world, i)
     if memory.search[world, i].active == 0 and algebra.is_known(P):
         marker = vec3d(model.scene.marker[model.landmarks + i])
         if wp.length_sq(marker) > wp.float64(0.0):

@@ -41,6 +41,7 @@ from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.correlated_fusion import fuse_messages
 from coopenv.observers.robust.correlations import clear_broadcasts, receive_broadcast, send_broadcast
 from coopenv.observers.robust.fault_hypotheses import detect_and_exclude, test_excluded
+from coopenv.observers.robust.guard import guard_covariance
 from coopenv.observers.robust.integrity import correct_sources, protection_level
 from coopenv.observers.robust.joint_state import (
     apply_error,
@@ -181,6 +182,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
     state.nis[world, i] = nis
     state.nis_dof[world, i] = 2 * fitting - unused_rows(memory, world, i, frame.bearings)
     if share >= wp.float64(0.0):  # rejected bearings show faults
+        guard_covariance(frame, memory, world, i)
         iterated_update(frame, memory, world, i)
         correct_sources(frame, memory, world, i)
     memory.belief[world, i].block_time += frame.period

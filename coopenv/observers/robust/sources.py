@@ -57,6 +57,18 @@ def is_own(q: int) -> bool:
 
 
 @device_function
+def guard_factor(memory: Any, world: int, i: int):
+    """Return the factor on the covariance of the own pose that is stated and broadcast."""
+    return wp.max(memory.belief[world, i].guard.factor, wp.float64(1.0))
+
+
+@device_function
+def guarded_covariance(memory: Any, world: int, i: int):
+    """Return the covariance (6, 6) of the own pose that is stated and broadcast, likely faults included."""
+    return guard_factor(memory, world, i) * (memory.P[world, i, 0, 0] + memory.fault_mixture[world, i])
+
+
+@device_function
 def clear_drift(memory: Any, world: int, i: int, q: int):
     """Begin the sums of a sender's drift anew."""
     memory.source[world, i, q].drift = vec3d()
