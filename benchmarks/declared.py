@@ -1,4 +1,4 @@
-"""`python -m benchmarks.declared`: accuracy and consistency of observers with errors that cameras, maps and wheels have.
+"""`python -m benchmarks.declared`: accuracy and consistency with errors that cameras, maps and wheels have.
 
 Worlds draw the errors, and the observers know their standard deviations. The scenes are `busy_intersection_tracking` at
 20 Hz, at walking pace, and a road with two platoons at 25 m/s (`benchmarks.evidence`). Runs are judged from half of the
