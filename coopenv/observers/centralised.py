@@ -109,7 +109,8 @@ class Centralised:
     def report(self, j: int, tick: Tick) -> Message:
         """Return what a vehicle's message would state of its marker."""
         (R, p), marker = self.poses[j], self.markers[j]
-        velocity = R.dot(tick.velocity + np.cross(tick.angular_velocity, marker)) if self.moves else None
+        moves = self.moves or tick.bearing_age > 0.0
+        velocity = R.dot(tick.velocity + np.cross(tick.angular_velocity, marker)) if moves else None
         return Message(p + R.dot(marker), R, extra={} if velocity is None else {"velocity": velocity})
 
     def correct(self, ticks: Sequence[Tick], measured: Mapping[int, UsableMeasurements]) -> None:

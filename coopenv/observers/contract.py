@@ -213,6 +213,7 @@ class Tick:
     readings: tuple[Reading, ...] = ()  # of the sensors beside the camera, in the order of `Setup.sensors`
     landmark_rotation: Array | None = None  # as in `Setup`
     landmark_names: tuple[str, ...] = ()  # (L,) of the landmarks, or empty
+    landmark_std: tuple[float, ...] = ()  # as in `Setup`
     bearing_age: float = 0.0  # s since the frame was exposed
 
     @cached_property

@@ -251,15 +251,36 @@ def judged(
 PLACES = types.Array(types.int64, 1, "A", readonly=True)
 
 
-CONSTANTS = types.Tuple((MATRICES, VECTOR))
-BY_POSE, BY_ROW, BY_VALUE = slice(0, 6), slice(6, 6 + MOST_ROWS), 6 + MOST_ROWS
-Constants = tuple[Array, Array]
-"""Constants behind the own pose in a state: what they change, by sensor (s, 7 + MOST_ROWS, c), and their values (c,).
+CONSTANTS = types.Tuple((MATRICES, VECTOR, WHOLE))
+BY_POSE, BY_ROW, BY_VALUE, BY_TIME = slice(0, 6), slice(6, 6 + MOST_ROWS), 6 + MOST_ROWS, 7 + MOST_ROWS
+Constants = tuple[Array, Array, int]
+"""Constants behind the own pose in a state: what they change, by sensor (s, 8 + MOST_ROWS, c), their values (c,), and
+how many of them, the first ones, are estimated; the others are considered.
 
-They change measurements as a left error of the pose does (`BY_POSE`), rows (`BY_ROW`), and the first row by a multiple
-of the measured value (`BY_VALUE`)."""
-NO_CONSTANTS = np.zeros((1, BY_VALUE + 1, 0)), np.zeros(0)
+They change measurements as a left error of the pose does (`BY_POSE`), rows (`BY_ROW`), the first row by a multiple
+of the measured value (`BY_VALUE`), and all rows as the motion of the target over a time does (`BY_TIME`)."""
+NO_CONSTANTS = np.zeros((1, BY_TIME + 1, 0)), np.zeros(0), 0
 NO_PLACES, NO_CROSSES = np.zeros(0, np.int64), np.zeros((0, 6, 6))  # without neighbours
+
+
+@compiled(TARGET, MATRIX, MATRIX, VECTOR, VECTOR)
+def add_motion(columns: Array, by_target: Array, rotation: Array, velocity: Array, times: Array) -> None:
+    """Add the motion of a target over times (c,), s per unit of a constant, to derivatives (r, c) by constants.
+
+    Args:
+        columns: changed in place.
+        by_target: (r, 6) derivative by turn and shift of the target in its axes.
+        rotation: (3, 3) its axes to the map; zero or NaN: those of the map.
+        velocity: (3,) of it, map axes, m/s.
+        times: how late it is measured, negative for the past.
+    """
+    shift = velocity.copy()
+    if rotation[0, 0] ** 2 + rotation[1, 0] ** 2 + rotation[2, 0] ** 2 > 0.0:
+        shift = transformed(rotation.T, velocity)
+    rate = transformed(by_target[:, 3:], shift)
+    for k in range(len(columns)):
+        for c in range(len(times)):
+            columns[k, c] += rate[k] * times[c]
 
 
 @compiled(TARGET, MATRICES, MATRICES, FLAG_ROWS, FRAME, MATRIX, CONSTANTS, PLACES, WHOLE)
@@ -287,7 +308,7 @@ def joint_jacobian(
         places: (m,) the neighbour of each measurement, -1: none; empty without neighbours.
         neighbours: k.
     """
-    (m, r, _), (by_sensor, values) = H.shape, constants
+    (m, r, _), (by_sensor, values, _) = H.shape, constants
     own = 6 + len(values)
     whole = np.zeros((m, r, own + 6 * neighbours))
     for n in range(m):
@@ -296,6 +317,8 @@ def joint_jacobian(
             of = by_sensor[frame[0].sensor[n]]
             columns = product(H[n], of[BY_POSE]) + of[BY_ROW][:r]
             columns[0] += frame[0].value[n, 0] * of[BY_VALUE]
+            if np.any(of[BY_TIME] != 0.0):
+                add_motion(columns, by_target[n], frame[0].rotation[n], frame[0].velocity[n], of[BY_TIME])
             explained = transformed(columns, values)
             for k in range(r):
                 if used[n, k]:
@@ -315,10 +338,10 @@ def looked(
     H is the derivative by the errors about the prediction; `recentring` (6, 6) is theirs. The poses of neighbours stay
     as they are. The other arguments are those of `halfway_gain`.
     """
-    by_sensor, values = constants
+    by_sensor, values, estimated = constants
     own = 6 + len(values)
     residual, H, N, by_target, _, used, _, _ = linearise(R, p, kind == RIGHT, frame)
-    moved_constants = by_sensor, values + at[6:own]
+    moved_constants = by_sensor, values + at[6:own], estimated
     neighbours = (len(at) - own) // 6
     whole = joint_jacobian(residual, H, by_target, used, frame, recentring, moved_constants, places, neighbours)
     return stacked(residual, whole, N, by_target, used, frame)
@@ -330,7 +353,7 @@ def halfway_gain(
 ) -> tuple[Array, Array, Array, Array, float]:
     """Return (K (n, k), H, N, dx (n,), r^T S^-1 r at the prediction) of the correction of a prediction.
 
-    H (k, n) and N (k, k) are those half way, where the poses of neighbours stay as they are.
+    H (k, n) and N (k, k) are those half way, where the poses of neighbours and considered constants stay as they are.
 
     Args:
         kind: of the own error.
@@ -344,7 +367,7 @@ def halfway_gain(
     at = np.zeros(len(P))
     residual, H, N = looked(kind, R, p, np.eye(6), at, frame, constants, places)
     _, dx, nis = gain(P, H, N, residual)
-    for n in range(6 + len(constants[1])):
+    for n in range(6 + constants[2]):
         at[n] = 0.5 * dx[n]
     R, p = moved(kind, R, p, at[:6])
     residual, H, N = looked(kind, R, p, recentring(kind, at[:6]), at, frame, constants, places)

@@ -18,7 +18,7 @@ from coopenv.estimation.compiled import adjoint
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Estimate, Setup, Tick
 from coopenv.observers.correction import NO_CONSTANTS, NO_CROSSES, NO_PLACES, InnovationGate, judged_frame
-from coopenv.observers.frame import usable_measurements
+from coopenv.observers.frame import CAMERA, usable_measurements
 from coopenv.observers.pose_filters import PoseObserver, unit
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose
 
@@ -107,11 +107,12 @@ class FactorGraph(PoseObserver):
             return
         judgement = judged_frame(*self.state, measured.frame, NO_CONSTANTS, NO_CROSSES, NO_PLACES)
         measured = measured.only(self.gate.passed(tick.time, judgement))
+        lever_arm = measured.sensors["position"][CAMERA]  # at the time of the frame
         for n, target in enumerate(measured.targets.tolist()):
             position = measured.positions[n]
             seen = self.residuals.setdefault(target, Residuals())
             seen.position, seen.covariance = position, measured.entries["covariance"][n, 3:, 3:]
-            seen.total = seen.total + R @ (measured.bearings[n] - unit((position - p) @ R - self.lever_arm))
+            seen.total = seen.total + R @ (measured.bearings[n] - unit((position - p) @ R - lever_arm))
             seen.count += 1
 
     def smooth(self) -> None:

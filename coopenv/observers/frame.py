@@ -1,4 +1,8 @@
-"""The usable measurements of a frame, of the camera and of other sensors, as a table of NumPy records."""
+"""The usable measurements of a frame, of the camera and of other sensors, as a table of NumPy records.
+
+A frame with an age was taken by a camera at another place of the body, which has moved since: the table has the camera
+and its bearings as the body of the tick would have them, and targets with a known velocity where they were.
+"""
 
 from collections.abc import Iterator
 from functools import lru_cache
@@ -10,7 +14,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from coopenv.estimation.compiled import NUMBER, WHOLE
+from coopenv.estimation.compiled import NUMBER, WHOLE, exp_so3, exp_translation
 from coopenv.estimation.poses import IDENTITY, Array
 from coopenv.measurements.kinds import MOST_ROWS
 from coopenv.measurements.sensor import MAP, Sensor
@@ -136,20 +140,27 @@ def usable_measurements(tick: Tick, weighed: bool = True) -> UsableMeasurements 
         if message is not None:
             messages[n] = message
             _put_report(entries, n, message)
+            if "velocity" in message.extra:
+                entries["velocity"][n] = np.nan_to_num(_velocity_of(message))
+        elif tick.landmark_std:
+            _put_accuracy(entries, n, tick)
     for n, (number, target, value, message) in enumerate(others, count):
         entries["sensor"][n], targets[n], values[n, : len(value)] = number, target, value
         if message is not None:
             messages[n], positions[n] = message, message.position
             entries["rotation"][n] = np.nan
             _put_report(entries, n, message)
-            velocity = np.asarray(message.extra.get("velocity", np.nan), float)
-            entries["velocity"][n] = velocity if velocity.shape == (3,) else np.nan
+            entries["velocity"][n] = _velocity_of(message)
         elif target != MAP:
             positions[n] = tick.landmarks[target]
             rotation = IDENTITY if tick.landmark_rotation is None else tick.landmark_rotation[target]
             entries["rotation"][n] = rotation
             entries["velocity"][n] = 0.0 if np.isfinite(rotation).all() else np.nan
+            if tick.landmark_std:
+                _put_accuracy(entries, n, tick)
     lever_arm, readings = np.asarray(tick.lever_arm, float), [reading.sensor for reading in tick.readings]
+    if tick.bearing_age > 0.0:
+        lever_arm = _dated(entries[:count], tick)
     sensors, compiled_alone = table_of_sensors(lever_arm.tobytes(), tick.noise.bearing_std, *readings)
     if not compiled_alone:
         ticks_of_own_kinds[id(tick)] = tick
@@ -169,6 +180,30 @@ def _other_measurements(tick: Tick) -> Iterator[tuple[int, int, Array, Message |
                     continue
                 message = received.message
             yield number, target, values[n], message
+
+
+def _velocity_of(message: Message) -> Array:
+    """Return the velocity (3,) of a target as reported, map axes, m/s, NaN where it is not."""
+    velocity = np.asarray(message.extra.get("velocity", np.nan), float)
+    return velocity if velocity.shape == (3,) else np.full(3, np.nan)
+
+
+def _dated(bearings: NDArray[Any], tick: Tick) -> Array:
+    """Change bearings (m,) to those of a frame with an age, and return the camera's place (3,) at that time, m."""
+    turn = -tick.bearing_age * np.asarray(tick.angular_velocity, float)
+    shift = exp_translation(turn, -tick.bearing_age * np.asarray(tick.velocity, float))
+    R = exp_so3(turn)
+    bearings["value"][:, :3] = bearings["value"][:, :3].dot(R.T)
+    bearings["position"] -= tick.bearing_age * bearings["velocity"]
+    return R.dot(np.asarray(tick.lever_arm, float)) + shift
+
+
+def _put_accuracy(entries: NDArray[Any], n: int, tick: Tick) -> None:
+    """Write the covariance of a landmark's position on the map, and its axes."""
+    target = int(entries["target"][n])
+    if tick.landmark_rotation is not None:
+        entries["rotation"][n] = tick.landmark_rotation[target]
+    entries["covariance"][n, 3:, 3:] = tick.landmark_std[target] ** 2 * IDENTITY
 
 
 def _put_report(entries: NDArray[Any], n: int, message: Message) -> None:

@@ -64,10 +64,10 @@ STACK = types.Array(types.float64, 4, "A", readonly=True)
 
 
 class OtherFactors(NamedTuple):
-    """The measurements of one vehicle's sensors beside the camera at a frame."""
+    """The measurements of one vehicle's sensors beside the camera at a frame, and bearings of a frame with an age."""
 
     vehicle: int
-    tick: Tick  # without bearings
+    tick: Tick  # without bearings, but for those of a frame with an age
     ticks: tuple[Tick, ...]  # of all vehicles
     kept: NDArray[np.bool_]  # which of the usable measurements have passed the gate
 
@@ -117,9 +117,11 @@ class FrameGraph:
         self.begin[self.frames] = end
 
     def add_others(self, vehicle: int, ticks: Sequence[Tick], kept: NDArray[np.bool_]) -> None:
-        """Add the measurements (m,) of a vehicle's sensors beside the camera to the last frame, those of a mask."""
-        unseen = replace(ticks[vehicle], valid=np.zeros_like(ticks[vehicle].valid))
-        self.others.setdefault(self.frames - 1, []).append(OtherFactors(vehicle, unseen, tuple(ticks), kept))
+        """Add measurements (m,) of a vehicle to the last frame, see `OtherFactors`, those of a mask."""
+        tick = ticks[vehicle]
+        if not tick.bearing_age > 0.0:
+            tick = replace(tick, valid=np.zeros_like(tick.valid))
+        self.others.setdefault(self.frames - 1, []).append(OtherFactors(vehicle, tick, tuple(ticks), kept))
 
     def reports(self, frame: int, ticks: Sequence[Tick], P: Array | None = None) -> dict[int, Received]:
         """Return what messages of all vehicles would state of a frame, by target; P (N, 6, 6): with covariances."""
@@ -248,6 +250,9 @@ class GraphEstimator(ABC):
         pose = UncertainPose(LEFT, graph.R[k, vehicle], graph.p[k, vehicle], self.P[vehicle])
         judgement = judged_frame(*pose, measured.frame, NO_CONSTANTS, NO_CROSSES, NO_PLACES)
         kept = self.gates[vehicle].passed(tick.time, judgement)
+        if tick.bearing_age > 0.0:
+            graph.add_others(vehicle, ticks, kept)
+            return
         bearings = measured.only(kept).of_camera()
         graph.add(vehicle, bearings.targets, bearings.bearings, bearings.positions)
         if len(measured.sensors) > 1:

@@ -33,6 +33,7 @@ from coopenv.observers.correction import (
 from coopenv.observers.frame import CAMERA, FRAME, Frame, UsableMeasurements, usable_measurements
 from coopenv.observers.guard import Guard
 from coopenv.observers.kernel_observer import KernelObserver
+from coopenv.observers.lasting_errors import LastingErrors
 from coopenv.observers.linearisation import LinearMeasurements, across, dense, linearised, normalised
 from coopenv.observers.p3p import solve_p3p
 from coopenv.observers.riccati import RICCATI
@@ -48,6 +49,8 @@ class PoseObserver:
     def __init__(self, setup: Setup) -> None:
         self.marker = setup.marker  # the point that sensors of other vehicles measure
         self.needed = {name for sensor in setup.sensors for name in sensor.kind.needs}
+        if setup.noise.latency or setup.noise.latency_jitter:
+            self.needed.add("velocity")
         self.twist = np.zeros(3), np.zeros(3)  # m/s and rad/s, body axes
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
@@ -69,7 +72,7 @@ class PoseObserver:
         return Message(position=position, covariance=covariance, extra=self.extra())
 
     def extra(self) -> dict[str, Array]:
-        """Return the velocity of the marker, map, m/s, if sensors need it."""
+        """Return the velocity of the marker, map, m/s, if sensors or late frames need it."""
         if "velocity" not in self.needed:
             return {}
         velocity, rate = self.twist
@@ -85,20 +88,32 @@ class Mekf(PoseObserver):
     sends_covariance = False
     gated = True  # else every bearing is used
     guarded = False  # whether a guard multiplies the covariance that is stated and broadcast
+    counts_errors = True  # whether declared errors of sensors and map count as noise
+
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(setup)
+        self.lasting = LastingErrors(setup)
+        self.counts_errors = self.counts_errors and self.lasting.counts
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
         super().reset(initial_pose, initial_covariance)
         self.gate, self.guard = InnovationGate(), Guard()
+        self.lasting.reset()
         self.measured: dict[int, float] = {}  # s, time of the last measurement of each sensor beside the camera
 
     def update(self, tick: Tick) -> Estimate:
         """Predict, then correct by every usable bearing."""
+        if tick.bearing_age > 0.0:
+            self.needed.add("velocity")
         self.predict(tick)
         self.nis: float | None = None
         self.nis_dof = 0
         measured = usable_measurements(tick, self.sends_covariance) if tick.due else None
         if measured is not None:
+            if self.counts_errors:
+                variances = self.lasting.counted(tick, linearised(self.state._replace(kind=LEFT), measured))
+                measured.entries["curvature"][:, : variances.shape[1]] += variances
             self.take(tick, measured)
         return self.stated.estimate(self.nis, self.nis_dof)
 
@@ -121,8 +136,9 @@ class Mekf(PoseObserver):
             judgement = self.judged(measured)
             kept = self.gate.passed(tick.time, judgement)
             if self.guarded:
-                of_vehicles = measured.targets >= len(tick.landmarks)
-                self.guard.add(tick.time, measured.targets, judgement[-1], of_vehicles)
+                last = (measured.targets >= len(tick.landmarks)) | (measured.entries["covariance"][:, 3, 3] > 0.0)
+                last |= self.lasting.estimated < len(self.lasting.states)
+                self.guard.add(tick.time, measured.targets, judgement[-1], last)
             if not kept.all():
                 measured = measured.only(kept)
         if len(measured.entries):
@@ -138,7 +154,7 @@ class Mekf(PoseObserver):
         linear, axes, line = linearised(self.state, measured), measured.axes, measured.positions - self.state.p
         G = linear.by_target[..., 3:] @ axes.swapaxes(1, 2)
         found = curvature(G, linear.angle, line, self.covariances_of_lines(measured, axes), frames)
-        measured.entries["curvature"][:, : found.shape[1]] = found
+        measured.entries["curvature"][:, : found.shape[1]] += found
 
     def covariances_of_lines(self, measured: UsableMeasurements, axes: Array) -> Array:
         """Return (m, 3, 3) the covariances of the lines from the vehicle to its targets, map axes, m^2."""
@@ -375,17 +391,18 @@ class PerspectivePoints(PoseObserver):
             self.contradicted = 0.0 if expected else self.contradicted + tick.dt
             if expected and self.state.P[0, 0] + self.state.P[1, 1] + self.state.P[2, 2] < NARROW_STD**2:
                 return  # weak geometry at a plausible pose
-            found = self.chosen(tick, data)
+            found = self.chosen(data)
         if found is not None and (distance(found, self.state) < POSE_GATE or self.contradicted > PATIENCE):
             self.state, self.contradicted = found, 0.0
 
-    def chosen(self, tick: Tick, data: UsableMeasurements) -> UncertainPose | None:
+    def chosen(self, data: UsableMeasurements) -> UncertainPose | None:
         """Return the candidate that agrees with most bearings, then the one nearest to the predicted pose."""
         best, most, nearest = None, 3, inf
         triples = np.array([*islice(combinations(range(len(data.bearings)), 3), MOST_TRIPLES)])
         turns, cameras, mask = solve_p3p(data.bearings[triples], data.positions[triples])
+        lever_arm = data.sensors["position"][CAMERA]
         for R, camera in zip(turns[mask], cameras[mask], strict=True):
-            start = UncertainPose(LEFT, R, camera - R @ tick.lever_arm, self.state.P)
+            start = UncertainPose(LEFT, R, camera - R @ lever_arm, self.state.P)
             agrees = misfits(start, data) < BEARING_GATE
             if (count := int(agrees.sum())) < most:
                 continue

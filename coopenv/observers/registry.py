@@ -51,6 +51,7 @@ ZOO = {
     "split_covariance_intersection": ZooEntry("covariance_intersection:SplitCovarianceIntersection"),
     "pairwise": ZooEntry("schmidt_kalman:Pairwise"),
     "schmidt_kalman": ZooEntry("schmidt_kalman:SchmidtKalman"),
+    "schmidt_calibrating": ZooEntry("schmidt_kalman:SchmidtCalibrating"),
     "schmidt_kalman_individual": ZooEntry("schmidt_kalman:SchmidtKalmanIndividual"),
     "self_calibrating": ZooEntry("self_calibrating:SelfCalibrating", of_robots=True),
     "iterated_ekf": ZooEntry("pose_filters:IteratedEkf"),

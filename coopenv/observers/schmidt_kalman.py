@@ -14,13 +14,23 @@ Burgard, Recursive decentralized localization for multi-robot systems with async
 International Journal of Robotics Research 37(10), 2018. It is exact for odometry and landmarks. For bearings to a third
 vehicle it holds if that vehicle correlates with j only by way of i.
 
+Behind the pose the own error has the lasting errors that the vehicle's noise and sensors declare. Those in `estimated`
+are corrected, the others are considered, too. So are the errors of the map: a landmark with a standard deviation is a
+neighbour that does not move, whose error is the same for all vehicles. Its cross-covariance with a neighbour is the one
+that the neighbour has sent.
+
+Two neighbours of which neither has sent their cross-covariance count as independent given the others in view that both
+correlate with: C_ab = C_aS P_SS^-1 C_Sb. That is the covariance of largest entropy with the known blocks. Source:
+Dempster, Covariance selection, Biometrics 28(1), 1972. Zeros would state that errors with a common cause are
+independent.
+
 In that work a measurement corrects both vehicles, which exchange covariances and factors both ways. Here messages are
 broadcast, and the target of a bearing does not receive it: j is considered, and only i is corrected. The product
 Sigma_ij is kept by i and propagated by j's factor.
 """
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Collection, Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,11 +48,10 @@ from coopenv.estimation.compiled import (
     place,
     product,
 )
-from coopenv.estimation.poses import Array, cholesky
+from coopenv.estimation.poses import Array, cholesky, solve
 from coopenv.observers.contract import Message, Setup, Tick
 from coopenv.observers.correction import (
     CONSTANTS,
-    NO_CONSTANTS,
     PLACES,
     Constants,
     Judgement,
@@ -52,8 +61,9 @@ from coopenv.observers.correction import (
 )
 from coopenv.observers.frame import FRAME, Frame, UsableMeasurements
 from coopenv.observers.joint_gate import fitting_together, innovation, largest_of
+from coopenv.observers.lasting_errors import EVERY, LastingErrors
 from coopenv.observers.pose_filters import Mekf
-from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, moved, recentring, transition
+from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, moved, predicted, recentring, transition
 
 MOST_LOST = 60  # lost messages in a row that a received factor may stand for
 SHRINKING = (0.98, 0.9, 0.7, 0.4, 0.0)
@@ -65,38 +75,58 @@ class ConsideredNeighbour(NamedTuple):
 
     number: int  # of its last message
     P: Array  # (6, 6) as reported, about its marker
-    cross: Array  # (6, 6) C_ij
+    cross: Array  # (n, 6) C_ij
+
+
+LEAST_VARIANCE = 1e-12  # rad^2, of a landmark's orientation, which counts as known
 
 
 class ConsiderFilter(Mekf):
-    """Base of the filters that keep cross-covariances; the own error is a left one."""
+    """Base of the filters that keep cross-covariances; the own error is a left one, and the lasting errors behind it.
+
+    `estimated` names lasting errors that the filter estimates (`lasting_errors.EVERY`); it considers the others.
+    """
 
     sends_covariance = True
     guarded = True
     jointly = True  # whether measurements of a frame must also fit together
-
-    @property
-    def covariance(self) -> Array:
-        """(n, n) covariance of the own error: that of the pose, and whatever else a subclass estimates behind it."""
-        return self.state.P
-
-    @property
-    def constants(self) -> Constants:
-        """Constants of the sensors that a subclass estimates."""
-        return NO_CONSTANTS
+    counts_errors = False
+    estimated: ClassVar[Collection[str]] = ()
 
     def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
         marker = np.asarray(setup.marker, float)
         self.to_marker = adjoint(np.eye(3), -marker)  # own left error to that of the marker's pose
         self.from_marker = adjoint(np.eye(3), marker)
+        self.landmarks = setup.landmarks
+        self.lasting = LastingErrors(setup, self.estimated)
+        self.map_covariances = {
+            n: np.diag([*[LEAST_VARIANCE] * 3, *[std**2] * 3])
+            for n, std in enumerate(setup.landmark_std)
+            if std > 0.0 and n in setup.targets
+        }
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
-        """Start at a pose that is independent of the other vehicles."""
+        """Start at a pose that is independent of the other vehicles and of the map, with lasting errors of zero."""
         super().reset(initial_pose, initial_covariance)
-        self.neighbours: dict[int, ConsideredNeighbour] = {}
-        self.identity = np.eye(len(self.covariance))
+        self.values = np.zeros(len(self.lasting.states))
+        self.P = block_diag(self.state.P, np.diag(self.lasting.variances)) if len(self.values) else self.state.P
+        self.lasting.reset()
+        self.by_sensor = self.lasting.by_sensor()
+        unknown = np.zeros((len(self.P), 6))
+        self.neighbours = {n: ConsideredNeighbour(0, P, unknown) for n, P in self.map_covariances.items()}
+        self.identity = np.eye(len(self.P))
         self.factor, self.number = self.identity, 0
+
+    @property
+    def covariance(self) -> Array:
+        """(6 + c, 6 + c) covariance of the errors of the pose and of the lasting errors."""
+        return self.P
+
+    @property
+    def constants(self) -> Constants:
+        """The lasting errors."""
+        return self.by_sensor, self.values, self.lasting.estimated
 
     def message(self) -> Message:
         """Return the marker's pose and covariance, and the factor since the last message with its number."""
@@ -108,9 +138,23 @@ class ConsiderFilter(Mekf):
         return Message(position, self.state.R, T.dot(self.stated.P).dot(T.T), extra)
 
     def predict(self, tick: Tick) -> None:
-        """Append the increment."""
-        self.propagate_cross_covariances(transition(*increment(tick)))
-        super().predict(tick)
+        """Append the increment without its lasting errors."""
+        if not len(self.values):
+            self.propagate_cross_covariances(transition(*increment(tick)))
+            super().predict(tick)
+            self.P = self.state.P
+            return
+        self.twist = tick.velocity, tick.angular_velocity
+        step, noise, lasts = self.lasting.step(tick, self.values), tick.noise.odometry(tick.dt), self.lasting.lasts
+        if self.lasting.late:
+            self.by_sensor = self.lasting.by_sensor()
+        A = self.identity.copy()
+        A[:6, :6], A[:6, 6:], A[6:, 6:] = transition(step.rotation, step.translation), step.by_errors, np.diag(lasts)
+        self.values = lasts * self.values
+        self.propagate_cross_covariances(A)
+        self.P = A.dot(self.P).dot(A.T) + np.diag([*noise, *self.lasting.noise(tick.dt)])
+        R, p, _ = predicted(LEFT, self.state.R, self.state.p, self.state.P, step.rotation, step.translation, noise)
+        self.state = UncertainPose(LEFT, R, p, self.P[:6, :6])
 
     def propagate_cross_covariances(self, A: Array, others: Sequence[int] | None = None) -> None:
         """Multiply the own error by A in the factor and in the cross-covariances with `others` (None: all)."""
@@ -162,20 +206,29 @@ class ConsiderFilter(Mekf):
     def fuse(self, measured: UsableMeasurements, between: Array | None = None) -> tuple[float, int]:
         """Correct by measurements of landmarks and of neighbours that are known; return what `Mekf.fuse` returns.
 
-        `between` (n, n, 6, 6) holds the covariances of the neighbours with each other, in the order of `seen`.
+        `between` (n + u, n + u, 6, 6) holds the covariances of the neighbours with each other, in the order of `seen`,
+        and after them those with the landmarks of `unseen`.
         """
         seen, places = self.places(measured)
-        of = [self.neighbours[t] for t in seen]
-        joint = made_definite(self.joint_covariance(seen, between), len(self.covariance))
+        of, own = [self.neighbours[t] for t in seen], len(self.P)
+        joint = made_definite(self.joint_covariance(seen, between), own)
         frame = measured.exact().frame
         made = self.considered(joint, frame, places)
         if self.jointly and not self.gate.is_open and made[6] > largest_of(made[7]):
             kept = fitting_together(*innovation(*self.state[1:3], joint, frame, self.constants, places), len(places))
             self.gate.refuse(int((~kept).sum()))
             made = self.considered(joint, (frame[0][kept], *frame[1:]), places[kept])
-        R, p, P, change, carried, crosses, nis, dof = made
+        R, p, P, change, remaining, crosses, nis, dof = made
+        carried = factor_of(joint, remaining)
+        for n, target in enumerate(self.unseen(seen), len(seen)):
+            number, variances, cross = self.neighbours[target]
+            if between is not None:
+                cross = np.concatenate([cross, *between[n, : len(seen)].swapaxes(-1, -2)])
+            after = remaining[:, : len(cross)].dot(cross)
+            self.neighbours[target] = ConsideredNeighbour(number, variances, after)
         self.set_corrected(R, p, P, change)
-        self.propagate_cross_covariances(carried, [t for t in self.neighbours if t not in seen])
+        others = [t for t in self.neighbours if t not in seen and t >= self.landmarks]
+        self.propagate_cross_covariances(carried, others)
         for target, was, cross in zip(seen, of, crosses, strict=True):
             self.neighbours[target] = ConsideredNeighbour(was.number, was.P, cross)
         return float(nis), dof
@@ -187,7 +240,11 @@ class ConsiderFilter(Mekf):
 
     def set_corrected(self, R: Array, p: Array, P: Array, change: Array) -> None:
         """Set the corrected pose, the covariance (n, n) of the own error, and the change of the constants (n - 6,)."""
-        self.state = UncertainPose(LEFT, R, p, P)
+        self.state, self.P, self.values = UncertainPose(LEFT, R, p, P[:6, :6]), P, self.values + change
+
+    def unseen(self, seen: Sequence[int]) -> list[int]:
+        """Return the landmarks with errors that are not among the targets `seen`."""
+        return [target for target in self.map_covariances if target not in seen]
 
     def seen(self, measured: UsableMeasurements) -> list[int]:
         """Return the known neighbours among the targets, each once."""
@@ -200,17 +257,39 @@ class ConsiderFilter(Mekf):
 
     def joint_covariance(self, seen: Sequence[int], between: Array | None = None) -> Array:
         """Return the joint covariance of the own error and those of neighbours; `between` as for `fuse`."""
-        own = len(self.covariance)
+        own = len(self.P)
         size = own + 6 * len(seen)
         joint = np.zeros((size, size))
-        joint[:own, :own] = self.covariance
+        joint[:own, :own] = self.P
         for n, target in enumerate(seen):
             k, (_, P, cross) = slice(own + 6 * n, own + 6 * n + 6), self.neighbours[target]
             joint[k, k], joint[:own, k], joint[k, :own] = P, cross, cross.T
             if between is not None and n:
                 joint[k, own : k.start] = between[n, :n].transpose(1, 0, 2).reshape(6, -1)
                 joint[own : k.start, k] = joint[k, own : k.start].T
+        if between is not None and len(seen) > 2:
+            complete(joint, own, [target < self.landmarks for target in seen])
         return joint
+
+
+def complete(joint: Array, own: int, still: Sequence[bool]) -> None:
+    """Fill in the cross-covariances of two neighbours that are zero, by the others.
+
+    Args:
+        joint: (n + 6k, n + 6k) covariance of the own error and those of k neighbours; changed in place.
+        own: n.
+        still: (k,) which neighbours are landmarks; the errors of two landmarks are independent.
+    """
+    at = [slice(k, k + 6) for k in range(own, len(joint), 6)]
+    known = joint[own:, own:].reshape(len(at), 6, len(at), 6).any(axis=(1, 3))
+    for a in range(len(at)):
+        for b in range(a):
+            between = np.flatnonzero(known[a] & known[b])
+            if known[a, b] or not len(between) or (still[a] and still[b]):
+                continue
+            S = np.concatenate([np.arange(at[c].start, at[c].stop) for c in between])
+            joint[at[a], at[b]] = joint[at[a], S].dot(solve(made_definite(joint[np.ix_(S, S)], 6), joint[S, at[b]]))
+            joint[at[b], at[a]] = joint[at[a], at[b]].T
 
 
 def made_definite(joint: Array, own: int) -> Array:
@@ -228,23 +307,33 @@ def made_definite(joint: Array, own: int) -> Array:
 Considered = tuple[Array, Array, Array, Array, Array, Array, float, int]
 
 
-@compiled(MATRIX, VECTOR, WHOLE, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, NUMBER)
+@compiled(MATRIX, VECTOR, WHOLE, WHOLE, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, NUMBER)
 def considered_from(
-    R: Array, p: Array, own: int, joint: Array, K: Array, whole: Array, N: Array, dx: Array, nis: float
+    R: Array, p: Array, own: int, estimated: int, joint: Array, K: Array, whole: Array, N: Array, dx: Array, nis: float
 ) -> Considered:
-    """Return the result of `considered` by that of `halfway_gain`, with an own error of `own` numbers."""
-    K = K.copy()
-    K[own:] = 0.0
+    """Return the result of `considered` by that of `halfway_gain`: own errors, of which the first are estimated."""
+    K, change = K.copy(), dx[6:own].copy()
+    K[estimated:], change[estimated - 6 :] = 0.0, 0.0
     after = joseph(joint, K, whole, N)
     R, p = moved(LEFT, R, p, dx[:6])
     recentred = np.eye(own)
     place(recentred, 0, 0, recentring(LEFT, dx[:6]))
     P = congruent(recentred, after[:own, :own])
-    carried = eliminated(joint[:own, :own], product(after[:own, :own], recentred.T)).T
+    remaining = product(recentred, np.eye(own, len(joint)) - product(K[:own], whole))
     crosses = np.empty(((len(joint) - own) // 6, own, 6))
     for n in range(len(crosses)):
         place(crosses[n], 0, 0, product(recentred, after[:own, own + 6 * n : own + 6 * n + 6]))
-    return R, p, P, dx[6:own], carried, crosses, nis, len(N)
+    return R, p, P, change, remaining, crosses, nis, len(N)
+
+
+@compiled(MATRIX, MATRIX)
+def factor_of(joint: Array, remaining: Array) -> Array:
+    """Return the factor (n, n) of cross-covariances with others, from the joint covariance before a correction.
+
+    `remaining` (n, n + 6k) is what remains of the errors before. Where all own errors are estimated it is P+ P-^-1.
+    """
+    own = len(remaining)
+    return eliminated(joint[:own, :own], product(remaining, joint[:, :own]).T).T
 
 
 @compiled(MATRIX, VECTOR, MATRIX, FRAME, CONSTANTS, PLACES)
@@ -260,11 +349,12 @@ def considered(R: Array, p: Array, joint: Array, frame: Frame, constants: Consta
         places: (m,) the neighbour of each measurement, -1: none.
 
     Returns:
-        Orientation, position, covariance (n, n), change of the constants (n - 6,), the factor (n, n) of the other
-        cross-covariances, those with the neighbours (k, n, 6), r^T S^-1 r at the prediction, and the number of rows.
+        Orientation, position, covariance (n, n), change of the constants (n - 6,), what remains (n, n + 6k) of the
+        errors before in the own one, the cross-covariances with the neighbours (k, n, 6), r^T S^-1 r at the prediction,
+        and the number of rows.
     """
     K, whole, N, dx, nis = halfway_gain(LEFT, R, p, joint, frame, constants, places)
-    return considered_from(R, p, 6 + len(constants[1]), joint, K, whole, N, dx, nis)
+    return considered_from(R, p, 6 + len(constants[1]), 6 + constants[2], joint, K, whole, N, dx, nis)
 
 
 @compiled(MATRIX, MATRIX, MATRIX)
@@ -288,7 +378,7 @@ def _has_factor(P: Array) -> bool:
 
 
 class SchmidtKalman(ConsiderFilter):
-    """Considers neighbours with cross-covariances.
+    """Considers neighbours with cross-covariances, lasting errors and the map.
 
     It sends its pose with covariance, its factor, and the cross-covariances that it keeps.
     """
@@ -304,11 +394,15 @@ class SchmidtKalman(ConsiderFilter):
     def correct(self, measured: UsableMeasurements) -> None:
         """Correct by all measurements at once."""
         messages = dict(zip(measured.targets.tolist(), measured.messages, strict=True))
-        seen = [(target, messages[target]) for target in self.seen(measured)]
-        between = np.zeros((len(seen), len(seen), 6, 6))
-        for n, (target, message) in enumerate(seen):
-            for m, (other, its) in enumerate(seen[:n]):
-                between[n, m] = self.between(sent_cross_covariance(message, other), sent_cross_covariance(its, target))
+        seen = self.seen(measured)
+        known = [*seen, *self.unseen(seen)]
+        between = np.zeros((len(known), len(known), 6, 6))
+        for n, target in enumerate(known):
+            for m, other in enumerate(seen[:n]):
+                ours, its = messages.get(target), messages[other]
+                if ours is not None or its is not None:
+                    sent = sent_cross_covariance(ours, other), sent_cross_covariance(its, target)
+                    between[n, m] = self.between(*sent)
         self.nis, self.nis_dof = self.fuse(measured, between)
 
     @staticmethod
@@ -326,12 +420,23 @@ class SchmidtKalmanIndividual(SchmidtKalman):
     guarded = jointly = False
 
 
-def sent_cross_covariance(message: Message, target: int) -> Array:
-    """Return the sent cross-covariance (6, 6) of a sender with a target, zero if the message has none."""
+def sent_cross_covariance(message: Message | None, target: int) -> Array:
+    """Return the sent cross-covariance (6, 6) of a sender with a target, zero if there is no message or it has none."""
+    if message is None:
+        return np.zeros((6, 6))
     targets, cross = (np.asarray(message.extra.get(name, ())) for name in ("targets", "cross"))
     if targets.ndim != 1 or cross.shape != (len(targets), 6, 6) or target not in (numbers := targets.tolist()):
         return np.zeros((6, 6))
     return np.asarray(cross[numbers.index(target)])
+
+
+class SchmidtCalibrating(SchmidtKalman):
+    """Schmidt filter that also estimates the lasting errors of its odometry and sensors.
+
+    It sends what `schmidt_kalman` sends.
+    """
+
+    estimated = EVERY
 
 
 class Pairwise(ConsiderFilter):
@@ -342,5 +447,5 @@ class Pairwise(ConsiderFilter):
 
     def correct(self, measured: UsableMeasurements) -> None:
         """Correct by the landmarks, then by neighbours one at a time."""
-        known = np.array([target not in self.neighbours for target in measured.targets.tolist()])
-        self.correct_in_turn(measured, known)
+        known = [target < self.landmarks or target not in self.neighbours for target in measured.targets.tolist()]
+        self.correct_in_turn(measured, np.array(known))

@@ -1,7 +1,6 @@
 """The Schmidt filter with lasting errors as states and corrections of neighbours, for vehicles in space and robots.
 
-The own error is that of the pose and, behind it, those of the lasting errors that the vehicle's noise and sensors
-declare. Neighbours consider the pose alone.
+Neighbours consider the pose alone, without the lasting errors behind it.
 
 A measurement of a neighbour, with innovation v, would also correct the neighbour's estimate: by K v, which reduces its
 covariance by K S K^T. The Schmidt filter leaves this out; here the message has it, and the neighbour corrects itself.
@@ -21,9 +20,9 @@ from numpy.typing import NDArray
 
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Message, Setup, Tick
-from coopenv.observers.correction import Constants, halfway_gain
+from coopenv.observers.correction import halfway_gain
 from coopenv.observers.frame import Frame, UsableMeasurements
-from coopenv.observers.lasting_errors import LastingErrors
+from coopenv.observers.lasting_errors import EVERY
 from coopenv.observers.schmidt_kalman import (
     Considered,
     ConsideredNeighbour,
@@ -32,7 +31,7 @@ from coopenv.observers.schmidt_kalman import (
     considered_from,
     sent_cross_covariance,
 )
-from coopenv.observers.uncertain_pose import LEFT, UncertainPose, moved, predicted, recentring, transition
+from coopenv.observers.uncertain_pose import LEFT, UncertainPose, moved, recentring
 
 REMEMBERED = 8  # own messages that a neighbour's correction may refer to
 
@@ -43,40 +42,23 @@ class SelfCalibrating(SchmidtKalman):
     It sends what `schmidt_kalman` sends, and corrections of the neighbours that it has measured.
     """
 
+    estimated = EVERY
+
     def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
         self.me = setup.landmarks + setup.vehicle
-        self.lasting = LastingErrors(setup.noise, setup.sensors)
-        self.by_sensor = self.lasting.by_sensor(setup.lever_arm)
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose, with lasting errors of zero."""
-        count = len(self.lasting.states)
-        self.values = np.zeros(count)
-        self.P = np.zeros((6 + count, 6 + count))
-        self.P[:6, :6], self.P[6:, 6:] = initial_covariance, np.diag(self.lasting.variances)
-        self.lasting.reset()
         self.since: dict[int, Array] = {}  # by number of an own message: derivative of the error by the marker's then
         self.corrections: dict[int, tuple[int, Array, Array]] = {}  # by target: number of its message, shift, reduction
         self.last: dict[int, Message] = {}  # by sender
         self.measured_at: dict[int, int] = {}  # by target: number of the first own message after its measurement
         super().reset(initial_pose, initial_covariance)
 
-    @property
-    def covariance(self) -> Array:
-        """(6 + c, 6 + c) covariance of the errors of the pose and of the lasting errors."""
-        return self.P
-
     def predict(self, tick: Tick) -> None:
-        """Append the increment without its lasting errors."""
-        self.twist = tick.velocity, tick.angular_velocity
-        step, noise = self.lasting.step(tick, self.values), tick.noise.odometry(tick.dt)
-        A = np.eye(len(self.P))
-        A[:6, :6], A[:6, 6:] = transition(step.rotation, step.translation), step.by_errors
-        self.propagate_cross_covariances(A)
-        self.P = A @ self.P @ A.T + np.diag([*noise, *self.lasting.walk * tick.dt])
-        R, p, _ = predicted(LEFT, self.state.R, self.state.p, self.state.P, step.rotation, step.translation, noise)
-        self.state = UncertainPose(LEFT, R, p, self.P[:6, :6])
+        """Append the increment, then receive the messages that have come."""
+        super().predict(tick)
         for target, received in tick.messages.items():
             if self.last.get(target) is not received.message:
                 self.last[target] = received.message
@@ -156,15 +138,6 @@ class SelfCalibrating(SchmidtKalman):
         self.state = UncertainPose(LEFT, *moved(LEFT, self.state.R, self.state.p, dx[:6]), self.P[:6, :6])
         self.propagate_cross_covariances(carried)
 
-    @property
-    def constants(self) -> Constants:
-        """The lasting errors."""
-        return self.by_sensor, self.values
-
-    def set_corrected(self, R: Array, p: Array, P: Array, change: Array) -> None:
-        """Set the corrected pose and lasting errors."""
-        self.state, self.P, self.values = UncertainPose(LEFT, R, p, P[:6, :6]), P, self.values + change
-
     def considered(self, joint: Array, frame: Frame, places: NDArray[np.int64]) -> Considered:
         """Return the correction of the own error, and keep what the measurements show of the neighbours."""
         R, p, size = self.state.R, self.state.p, len(self.P)
@@ -172,13 +145,15 @@ class SelfCalibrating(SchmidtKalman):
         self.gained = [
             (dx[k : k + 6], K[k : k + 6].dot(whole).dot(joint[:, k : k + 6])) for k in range(size, len(joint), 6)
         ]
-        made: Considered = considered_from(R, p, size, joint, K, whole, N, dx, nis)
+        made: Considered = considered_from(R, p, size, size, joint, K, whole, N, dx, nis)
         return made
 
     def fuse(self, measured: UsableMeasurements, between: Array | None = None) -> tuple[float, int]:
         """Correct by measurements, and keep the corrections of the neighbours among the targets."""
         result = super().fuse(measured, between)
         for target, (shift, reduced) in zip(self.seen(measured), self.gained, strict=True):
+            if target < self.landmarks:
+                continue
             self.corrections[target] = self.neighbours[target].number, shift, (reduced + reduced.T) / 2
             self.measured_at[target] = self.number + 1
         return result

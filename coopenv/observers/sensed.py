@@ -116,6 +116,7 @@ class Sensed(Measurements):
             readings=tuple(self.reading(setup, sensor) for sensor in setup.sensors),
             landmark_rotation=setup.landmark_rotation,
             landmark_names=setup.target_names[: setup.landmarks],
+            landmark_std=setup.landmark_std,
             bearing_age=0.0 if self.bearing_age is None else float(self.bearing_age[i]),
         )
 

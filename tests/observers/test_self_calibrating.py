@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from coopenv.measurements.sensor import Reading, Sensor
 from coopenv.mrclam.recording import FLOOR_PERIOD_TICKS, RANGE_STD, RANGE_STD_BY_DISTANCE, recording_of
 from coopenv.observers import Message, Recording, Tick, run
-from coopenv.observers.contract import SensorNoise
+from coopenv.observers.contract import SensorNoise, Setup
 from coopenv.observers.correction import NO_PLACES, looked
 from coopenv.observers.frame import UsableMeasurements, usable_measurements
 from coopenv.observers.lasting_errors import LastingErrors
@@ -45,10 +45,16 @@ def moving_tick() -> Tick:
     return replace(tick, rotation=turn, translation=np.array([0.1, 0.02, -0.01]), lever_arm=np.array([0.3, -0.2, 0.5]))
 
 
+def setup_of(noise: SensorNoise) -> Setup:
+    """Return the setup of a vehicle with the noise and the camera of `moving_tick`."""
+    return replace(simulated().setups[1], noise=noise, lever_arm=moving_tick().lever_arm)
+
+
 def test_an_increment_changes_with_lasting_errors_as_its_derivative_says() -> None:
-    lasting, tick = LastingErrors(EVERY_ERROR), moving_tick()
+    lasting, tick = LastingErrors(setup_of(EVERY_ERROR)), moving_tick()
 
     def step(values: np.ndarray):
+        lasting.reset()
         lasting.before = np.array([[0.1, 0.2, 0.3], [1.0, 2.0, 3.0]])
         return lasting.step(tick, values)
 
@@ -65,7 +71,7 @@ def test_an_increment_changes_with_lasting_errors_as_its_derivative_says() -> No
 
 def test_wheels_that_read_too_much_are_corrected() -> None:
     wheels = replace(EVERY_ERROR, gyro_bias=(0.0, 0.0, 0.0), camera_orientation=0.0)
-    lasting, tick = LastingErrors(wheels), moving_tick()
+    lasting, tick = LastingErrors(setup_of(wheels)), moving_tick()
     lasting.reset()
     values = np.array([0.1, 0.2, 0.0, 0.0, 0.0])  # the speed's scale, the turn's, and three more
     step = lasting.step(tick, values)
@@ -77,7 +83,8 @@ def test_wheels_that_read_too_much_are_corrected() -> None:
 def test_a_turned_camera_moves_bearings_as_its_derivative_says() -> None:
     """The measured bearings are turned, by as much as the estimate of the camera's error explains."""
     only_camera = SensorNoise(0.1, 0.1, 0.05, 0.01, camera_orientation=0.1)
-    lasting, tick = LastingErrors(only_camera), moving_tick()
+    lasting, tick = LastingErrors(setup_of(only_camera)), moving_tick()
+    lasting.reset()
     recording = simulated()
     pose = UncertainPose(LEFT, recording.truth.rotation[20, 1], recording.truth.position[20, 1], np.eye(6))
     measured = usable_measurements(tick)
@@ -87,7 +94,8 @@ def test_a_turned_camera_moves_bearings_as_its_derivative_says() -> None:
         """Return residuals and derivatives of bearings, given the camera's turn."""
         entries = measured.entries.copy()
         entries["value"][:, :3] = bearings
-        frame, constants = measured._replace(entries=entries).frame, (lasting.by_sensor(tick.lever_arm), values)
+        frame = measured._replace(entries=entries).frame
+        constants = lasting.by_sensor(), values, len(values)
         residual, H, _ = looked(LEFT, pose.R, pose.p, np.eye(6), np.zeros(9), frame, constants, NO_PLACES)
         return residual, H
 
