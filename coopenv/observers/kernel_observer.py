@@ -63,7 +63,10 @@ def model_of(setup: Setup, p: Precision) -> Any:
     noise.gyro_bias, noise.gyro_bias_walk = p.vec3(*known.gyro_bias), p.vec3(*known.gyro_bias_walk)
     noise.slip_rate, noise.slip_duration, noise.slip_size, noise.slip_angle = known.slip
     camera.orientation_std, camera.position_std = known.camera_orientation, known.camera_position
-    camera.focal_std = known.focal_length
+    camera.focal_std, camera.orientation_walk = known.focal_length, known.camera_orientation_walk
+    camera.latency_std, camera.latency_jitter = known.latency, known.latency_jitter
+    accuracy = np.zeros(L) if setup.landmark_std is None else setup.landmark_std
+    model.landmark_std = wp.array(accuracy, dtype=p.scalar, device="cpu")
     fault = entry_struct(p, "fault")()
     fault.clock = known.clock_offset
     for name, entry in (("fault", fault), ("camera", camera), ("noise", noise)):
@@ -137,7 +140,7 @@ class KernelObserver:
         """The same of the memory."""
         self._now = [wp.zeros(1, dtype=kind, device="cpu") for kind in (wp.int32, wp.float64, wp.int32)]
         self._now_views = [array.numpy() for array in self._now]
-        self._noise_views = self._model.noise.numpy()
+        self._noise_views, self._camera_views = self._model.noise.numpy(), self._model.camera.numpy()
         self._start_covariance = self._model.start.covariance.numpy()[setup.vehicle]
         self._set_clock(None, setup.noise.odometry_period)
         self._received: dict[
@@ -200,6 +203,7 @@ class KernelObserver:
         s = self.state
         for name in ("velocity", "angular_velocity"):
             self._noise_views[name] = getattr(tick.noise, name)
+        self._camera_views["latency"] = tick.bearing_age
         s.increment_rotation[...], s.increment_translation[...] = tick.rotation, tick.translation
         s.odometry_velocity[...], s.odometry_angular_velocity[...] = tick.velocity, tick.angular_velocity
         s.position[: self.setup.landmarks] = tick.landmarks

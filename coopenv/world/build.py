@@ -282,6 +282,7 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "target_count": [len(targets) for targets in sets],
         "order": order,
         "rank": np.argsort(order),
+        "landmark_std": np.zeros(len(scenario.landmarks)),
         "clocks": any(f.clock_offset > 0.0 for f in faults),
         "restarts": any(f.restart.chance > 0.0 for f in faults),
         "alters": any(f.alters for f in faults),

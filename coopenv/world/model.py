@@ -239,6 +239,10 @@ def model_struct(p: Precision) -> Any:
         orientation_std: scalar  # rad, per axis, of the error of `rotation`
         position_std: scalar  # m, per axis, of the error of `position`
         focal_std: scalar  # of the error of `focal_length`, relative
+        orientation_walk: scalar  # rad per root of a second, of the error of `rotation`
+        latency: scalar  # s, known age of a frame
+        latency_std: scalar  # s, of a constant error of `latency`
+        latency_jitter: scalar  # s, of one drawn for every frame
 
     @wp.struct
     class NoiseValues:
@@ -410,6 +414,7 @@ def model_struct(p: Precision) -> Any:
         sensor: wp.array(dtype=SensorValues)  # (R,) beside cameras
         carries: wp.array2d(dtype=wp.int32)  # (N, R) 1: a vehicle has a sensor
         measures: wp.array2d(dtype=wp.int32)  # (R, A) 1: a sensor measures an agent
+        landmark_std: wp.array(dtype=scalar)  # (L,) m, accuracy of their places on the map
         fault: wp.array(dtype=FaultValues)  # (N,)
         clocks: wp.int32  # 1: some clock is off
         restarts: wp.int32  # 1: some vehicle may restart

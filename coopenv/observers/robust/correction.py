@@ -8,7 +8,7 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import by_rows, displaced, recentring, transposed_by_rows
 from coopenv.observers.robust.joint_state import apply_corrections, set_block
 from coopenv.observers.robust.linearisation import innovation_cross_covariance, innovation_weight, linearise, project
-from coopenv.observers.robust.memory import DERIVATIVES, ERRORS, BearingFrame, mat66d, vec6d
+from coopenv.observers.robust.memory import DERIVATIVES, ERRORS, LANDMARK_SLOTS, BearingFrame, mat66d, vec6d
 from coopenv.world.warp_internals import device_function, subroutine
 
 
@@ -47,6 +47,10 @@ def set_projection(memory: Any, world: int, i: int, n: int):
                 memory.projection[world, i, n, k] = (
                     memory.projection[world, i, n, k] - share * memory.projection[world, i, m, k]
                 )
+            if memory.belief[world, i].map_errors == 1:
+                for slot in range(LANDMARK_SLOTS):
+                    left = memory.map_projection[world, i, n, slot] - share * memory.map_projection[world, i, m, slot]
+                    memory.map_projection[world, i, n, slot] = left
     memory.measurement[world, i, n].weight = innovation_weight(
         memory, world, i, n, memory.measurement[world, i, n].noise
     )

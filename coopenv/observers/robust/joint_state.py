@@ -250,10 +250,10 @@ def begin_errors(model: Any, memory: Any, world: int, i: int):
     odometry = odometry_variances(noise.gyro_bias, wp.float64(constants.GYRO_BIAS), noise.odometry_scale)
     mounting = mounting_variances(model, i)
     focal = wp.float64(model.camera[i].focal_std)
-    one = wp.float64(1.0)  # an entry without a state is arbitrary
-    variances = vec6d(odometry[0], odometry[1], odometry[2], odometry[3], focal * focal, one)
+    latency = wp.float64(model.camera[i].latency_std)
+    variances = vec6d(odometry[0], odometry[1], odometry[2], odometry[3], focal * focal, latency * latency)
     begin_calibration(memory, world, i, ERRORS, variances)
-    if wp.max(mounting) > wp.float64(0.0):
+    if wp.max(mounting) + wp.float64(model.camera[i].orientation_walk) > wp.float64(0.0):
         variances = vec6d(mounting[0], mounting[0], mounting[0], mounting[1], mounting[1], mounting[1])
         begin_calibration(memory, world, i, MOUNTING, variances)
 
@@ -262,7 +262,8 @@ def begin_errors(model: Any, memory: Any, world: int, i: int):
 def walk_errors(model: Any, memory: Any, world: int, i: int, dt: Any):
     """Inflate the covariances of the calibration states by their walk over dt.
 
-    Odometry errors walk as declared and as estimated, see `SourceMonitor`; the mounting: see `CALIBRATION_CHANGE`.
+    Errors walk as declared; the odometry's scale also as estimated, see `SourceMonitor`, and the mounting by
+    `CALIBRATION_CHANGE`.
     """
     noise = model.noise[i]
     walk = odometry_variances(noise.gyro_bias_walk, wp.float64(constants.GYRO_BIAS_WALK), noise.odometry_scale_walk)
@@ -271,8 +272,11 @@ def walk_errors(model: Any, memory: Any, world: int, i: int, dt: Any):
         memory.P[world, i, ERRORS, ERRORS][k, k] += walk[k] * dt
     if mounting_of(memory, world, i) > 0:
         share = wp.float64(constants.CALIBRATION_CHANGE * constants.CALIBRATION_CHANGE) * dt
+        gained = share * mounting_variances(model, i)
+        turning = wp.float64(model.camera[i].orientation_walk)
+        gained[0] += turning * turning * dt
         P = memory.P[world, i, MOUNTING, MOUNTING]
-        memory.P[world, i, MOUNTING, MOUNTING] = with_noise(P, share * mounting_variances(model, i))
+        memory.P[world, i, MOUNTING, MOUNTING] = with_noise(P, gained)
 
 
 @device_function

@@ -301,6 +301,9 @@ def start(model: Any, state: Any, memory: Any, world: int, i: int):
     """
     clear(memory, world, i)
     memory.belief[world, i].first_sender = 1
+    for landmark in range(model.landmarks):
+        if model.landmark_std[landmark] > type(model.landmark_std[landmark])(0.0):
+            memory.belief[world, i].map_errors = 1
     begin_errors(model, memory, world, i)
     R = orthonormalise(mat33d(state.estimate_rotation[world, i]))
     initial = PoseEstimate(

@@ -29,6 +29,7 @@ from coopenv.observers.robust.measurements import (
     linearised_frames,
     relative_spread,
     set_bearing_measurement,
+    set_mapped_point,
     set_measurement_of_member,
 )
 from coopenv.observers.robust.memory import (
@@ -44,8 +45,7 @@ from coopenv.observers.robust.memory import (
     vec6d,
 )
 from coopenv.observers.robust.messages import is_circular
-from coopenv.observers.robust.sources import is_excluded, take_slot
-from coopenv.world.camera import mapped_position
+from coopenv.observers.robust.sources import is_excluded
 from coopenv.world.model import STATIC
 from coopenv.world.nearby import box_of_entry
 from coopenv.world.warp_internals import device_function, overload_of
@@ -109,10 +109,7 @@ def set_target(model: Any, state: Any, memory: Any, world: int, i: int, frame: B
     n = frame.bearings
     sender = target - model.landmarks
     if sender < 0:
-        point = vec3d(mapped_position(model, state, world, i, target))
-        set_bearing_measurement(memory, world, i, n, 0, vec3d(), point, wp.float64(0.0))
-        q = take_slot(memory, world, i, target, frame.tick, True, model.camera_period)
-        memory.measurement[world, i, n].source = q
+        set_mapped_point(model, state, memory, world, i, frame, target)
         memory.reading[world, i, n].turn = mat33d(state.rotation[world, target])
         memory.reading[world, i, n].turn_known = wp.where(model.motion.kind[target] == STATIC, 1, 0)
         return True
@@ -308,6 +305,7 @@ def linearise_reading_with_sensors(memory: Any, world: int, i: int, n: Any) -> b
             used += 1
     memory.reading[world, i, n].used = used
     memory.derivative[world, i, n, 0] = Derivative(0, H)
+    memory.measurement[world, i, n].by_map = -(H[:, 3:] * wp.transpose(own.R))
     memory.derivative[world, i, n, 1] = Derivative(wp.where(member > 0, member, -1), G)
     memory.derivative[world, i, n, 2] = Derivative(-1, mat26d())
     memory.derivative[world, i, n, 3] = Derivative(-1, mat26d())
