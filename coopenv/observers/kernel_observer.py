@@ -65,8 +65,7 @@ def model_of(setup: Setup, p: Precision) -> Any:
     camera.orientation_std, camera.position_std = known.camera_orientation, known.camera_position
     camera.focal_std, camera.orientation_walk = known.focal_length, known.camera_orientation_walk
     camera.latency_std, camera.latency_jitter = known.latency, known.latency_jitter
-    accuracy = np.zeros(L) if setup.landmark_std is None else setup.landmark_std
-    model.landmark_std = wp.array(accuracy, dtype=p.scalar, device="cpu")
+    model.landmark_std = wp.array(setup.landmark_std or np.zeros(L), dtype=p.scalar, device="cpu")
     fault = entry_struct(p, "fault")()
     fault.clock = known.clock_offset
     for name, entry in (("fault", fault), ("camera", camera), ("noise", noise)):
