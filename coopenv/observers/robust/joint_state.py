@@ -355,7 +355,7 @@ def jump_variance(change: Any, std: Any, period: Any):
 def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: Any):
     """Return the increment over a tick of dt and variances to add to its noise; propagate the dead reckoning.
 
-    The recent mean velocity is stored for `errors_transition`. Samples are held until the next one, so that their sum
+    The recent mean twist is stored for `errors_transition` and `approach`. Samples are held until the next one, so that their sum
     lags by half a period. Half the change of the held sample makes it the trapezoidal rule: (v0 + v1) T / 2 = v0 T +
     (v1 - v0) T / 2. The next sample removes the noise that this adds.
     """
@@ -375,8 +375,10 @@ def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: A
         noise[1] = jump_variance(change_v, wp.float64(model.noise[i].velocity), period)
         share = dt / (dt + wp.float64(constants.MEAN_TIME))
         memory.belief[world, i].mean_v += share * (v - memory.belief[world, i].mean_v)
+        memory.belief[world, i].mean_w += share * (w - memory.belief[world, i].mean_w)
     else:
         memory.belief[world, i].mean_v = v
+        memory.belief[world, i].mean_w = w
     memory.belief[world, i].has_sample = 1
     memory.belief[world, i].sample_v = v
     memory.belief[world, i].sample_w = w

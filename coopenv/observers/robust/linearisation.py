@@ -32,8 +32,12 @@ def tangent_basis(b: Any):
 
 @device_function
 def approach(memory: Any, world: int, i: int, member: int, turn: Any, point: Any, a: Any):
-    """Return the velocity (m/s, body) at which a target at `a` (m, body) approaches."""
-    velocity = memory.belief[world, i].sample_v + wp.cross(memory.belief[world, i].sample_w, a)
+    """Return the velocity (m/s, body) at which a target at `a` (m, body) approaches.
+
+    The twist is the mean of a second: by that of a sample, noise would seem to tell the latency, see
+    `errors_transition`.
+    """
+    velocity = memory.belief[world, i].mean_v + wp.cross(memory.belief[world, i].mean_w, a)
     if member > 0:
         moving = memory.member[world, i, member].v + wp.cross(memory.member[world, i, member].w, point)
         velocity = velocity - turn * moving
@@ -99,7 +103,7 @@ def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     memory.derivative[world, i, n, 3].jacobian = H
     memory.measurement[world, i, n].residual = T * bearing
     memory.measurement[world, i, n].distance = distance
-    remainder = linearisation_variance(memory, world, i, member, turn, u, distance, frame.period)
+    remainder = linearisation_variance(memory, world, i, n, turn, u, distance, frame.period)
     variance = frame.variance + memory.measurement[world, i, n].variance * inverse * inverse + remainder
     variance += frame.jitter * wp.length_sq(by_age)
     memory.measurement[world, i, n].noise = variance

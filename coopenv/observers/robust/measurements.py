@@ -269,39 +269,55 @@ def set_bearing_measurements(model: Any, state: Any, memory: Any, world: int, i:
 
 
 @device_function
-def linearisation_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: Any, distance: Any, period: Any):
-    """Return the variance of a bearing's second-order linearisation error, rad^2.
+def map_variance_of(memory: Any, world: int, i: int, n: int):
+    """Return the variance of the n-th measurement's landmark on the map that is considered, m^2 per axis."""
+    q = memory.measurement[world, i, n].source
+    variance = wp.float64(0.0)
+    if memory.belief[world, i].map_errors == 1 and q >= 0:
+        variance = memory.source[world, i, q].map_variance
+    return variance
+
+
+@device_function
+def linearisation_variance(memory: Any, world: int, i: int, n: int, turn: Any, u: Any, distance: Any, period: Any):
+    """Return the variance of the n-th bearing's second-order linearisation error, rad^2.
 
     With errors s of the relative position along the line of sight u and t across it, the direction is t / (d + s). Its
     term t s / d^2 is not linear. That error is correlated over a time, so that all frames of that time, one every
     `period`, count as one. `turn` rotates from the member's body to the vehicle's.
     """
-    along, across = relative_spread(memory, world, i, member, turn, u)
+    along, across = relative_spread(memory, world, i, n, turn, u)
     square = distance * distance
-    return linearised_frames(member, period) * along * across / (square * square)
+    return linearised_frames(memory, world, i, n, period) * along * across / (square * square)
 
 
 @device_function
-def linearised_frames(member: int, period: Any):
-    """Return how many frames have the same linearisation error of a measurement of a member, or of the map (0)."""
+def linearised_frames(memory: Any, world: int, i: int, n: int, period: Any):
+    """Return how many frames have the same linearisation error of the n-th measurement."""
     time = wp.float64(constants.LINEARISATION_TIME)
-    if member > 0:
+    considered = memory.measurement[world, i, n].member > 0
+    if considered or map_variance_of(memory, world, i, n) > wp.float64(0.0):
         time = wp.float64(constants.CONSIDERED_LINEARISATION_TIME)
     return frames_in(time, period)
 
 
 @device_function
-def relative_spread(memory: Any, world: int, i: int, member: int, turn: Any, u: Any):
-    """Return the variances, m^2, of a relative position along a direction u and, of both axes together, across it."""
+def relative_spread(memory: Any, world: int, i: int, n: int, turn: Any, u: Any):
+    """Return the variances, m^2, of the n-th target's relative position along a direction u, and across it.
+
+    The latter is the sum of two axes.
+    """
+    member = memory.measurement[world, i, n].member
     V = block3(memory.P[world, i, 0, 0], 3, 3)
     latency = memory.P[world, i, ERRORS, ERRORS][LATENCY_ERROR, LATENCY_ERROR]
     if latency > wp.float64(constants.MIN_VARIANCE):  # at the exposure
-        v = memory.belief[world, i].sample_v
+        v = memory.belief[world, i].mean_v
         c = memory.P[world, i, ERRORS, 0][LATENCY_ERROR]
         common = wp.outer(v, vec3d(c[3], c[4], c[5]))
         V = V - common - wp.transpose(common) + latency * wp.outer(v, v)
-    along = wp.dot(u, V * u)
-    total = wp.trace(V)
+    mapped = map_variance_of(memory, world, i, n)
+    along = wp.dot(u, V * u) + mapped
+    total = wp.trace(V) + wp.float64(3.0) * mapped
     if member > 0:
         # of V + turn W turn^T - C turn^T - turn C^T
         W = block3(memory.P[world, i, member, member], 3, 3)

@@ -112,6 +112,7 @@ class JointBelief:
     sample_v: vec3d  # m/s, body: the odometry sample held at the last tick's end
     sample_w: vec3d  # rad/s, body
     mean_v: vec3d  # m/s, body: of the samples of late, see joint_state.py
+    mean_w: vec3d  # rad/s, body, likewise
     members: wp.int32  # how many
     first_sender: wp.int32  # the first of them that is another vehicle; before it the calibration states
     depends_on: wp.uint64  # bits of vehicles

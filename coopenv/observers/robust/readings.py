@@ -216,14 +216,16 @@ def unused_rows_with_sensors(memory: Any, world: int, i: int, count: Any) -> int
 
 
 @device_function
-def bend_variances(member: int, period: Any, along: Any, across: Any):
+def bend_variances(memory: Any, world: int, i: int, n: int, along: Any, across: Any):
     """Return the variances of second-order errors, m^4, of rows across the line of sight and along it.
 
     They are to be multiplied by the squared derivatives by the target's position and divided by the squared distance.
     Ranges alone correct an error across them slowly, that of a landmark as well.
     """
+    period = memory.reading[world, i, n].period
     lasting = frames_in(wp.float64(constants.CONSIDERED_LINEARISATION_TIME), period)
-    return vec2d(linearised_frames(member, period) * along, wp.float64(0.5) * lasting * across) * across
+    frames = linearised_frames(memory, world, i, n, period)
+    return vec2d(frames * along, wp.float64(0.5) * lasting * across) * across
 
 
 @device_function
@@ -274,8 +276,8 @@ def linearise_reading_with_sensors(memory: Any, world: int, i: int, n: Any) -> b
     bend = vec2d()
     if kind != RELATIVE_POSE:  # which is linear in the positions
         to_own = wp.transpose(own.R)
-        along, across = relative_spread(memory, world, i, member, to_own * theirs_R, to_own * u)
-        bend = bend_variances(member, memory.reading[world, i, n].period, along, across) / (distance * distance)
+        along, across = relative_spread(memory, world, i, n, to_own * theirs_R, to_own * u)
+        bend = bend_variances(memory, world, i, n, along, across) / (distance * distance)
     arm = own.R * skew(place)
     reach = theirs_R * skew(point)
     H = mat26d()
