@@ -118,8 +118,13 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         self._step, self._outcomes = Step(self.engine.view, scenario), outcome_words(scenario)
         self._targets = scenario.target_names  # made once, as every step needs both
         self._notes = backend.notes if isinstance(backend, Broadcasting) else None
-        lasting = (*LASTING_ERRORS, "camera_focal") if scenario.has_lasting_errors else ()
-        self._lasting = (*lasting, *(FAULTS if any(faults.any for faults in scenario.all_faults) else ()))
+        errors = {
+            (*LASTING_ERRORS, "camera_focal"): scenario.has_lasting_errors,
+            ("camera_delay",): any(camera.is_late for camera in scenario.cameras),
+            ("map_offset",): scenario.landmark_std,
+            FAULTS: any(faults.any for faults in scenario.all_faults),
+        }
+        self._lasting = [name for names, there in errors.items() if there for name in names]
 
     @property
     def agents(self) -> list[str]:

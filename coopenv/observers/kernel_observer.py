@@ -206,6 +206,7 @@ class KernelObserver:
         s.increment_rotation[...], s.increment_translation[...] = tick.rotation, tick.translation
         s.odometry_velocity[...], s.odometry_angular_velocity[...] = tick.velocity, tick.angular_velocity
         s.position[: self.setup.landmarks] = tick.landmarks
+        s.bearing_age[...] = tick.bearing_age
         s.sight[tick.targets] = np.where(tick.valid, _VISIBLE, _OUT_OF_VIEW)
         seen = tick.targets[tick.valid]
         s.bearing[seen], s.bearing_tick[seen] = tick.bearings[tick.valid] @ self._camera, now

@@ -235,6 +235,7 @@ def scene(scenario: Scenario, grouped: bool = True) -> Iterator[Table]:
                 f"drawn by group {mark.group}" if mark.group else vector(mark.position),
                 any(mark.position_spread) and f"+- {vector(mark.position_spread)}",
                 mark.presence < 1.0 and f"there with {number(100.0 * mark.presence)} %",
+                mark.accuracy and f"known to {number(mark.accuracy)} m",
             ),
             *(motion(mark.motion), size(mark.body.size) if mark.body else "none"),
         )

@@ -22,7 +22,7 @@ from coopenv.runs import scenario_text
 from coopenv.runs.scenario_text import settings, text_table
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.scenes import scene_rows
-from coopenv.scenario.sensing import Noise
+from coopenv.scenario.sensing import Camera, Noise
 from coopenv.scenario.sensors import SensorSection
 from coopenv.sources.registry import ENVIRONMENT, LOG, kinds
 
@@ -123,13 +123,16 @@ def _targets(scenario: Scenario) -> str:
             "blind": "blind sensing: nothing is measured",
             "images": f"images: tags ({scenario.images.family}) are detected in rendered frames",
         }[scenario.sensing]
-    landmarks = _several(len(scenario.landmarks), "landmark") + (f" ({moving} moving)" if moving else "")
+    accuracy = f"{_span(scenario.landmark_std)} m" if scenario.landmark_std else ""
+    notes = _joined(", ", moving and f"{moving} moving", accuracy and f"known to {accuracy}")
+    landmarks = _several(len(scenario.landmarks), "landmark") + (f" ({notes})" if notes else "")
     buildings = scenario.obstacles and _several(len(scenario.obstacles), "building")
     return f"{_joined(', ', landmarks, len(scenario.vehicles) > 1 and 'other vehicles', buildings)}; {mode}"
 
 
 def _camera(scenario: Scenario) -> str:
     camera, noise, noisy = scenario.camera, scenario.noise.bearing, scenario.noise.enabled
+    correlated = noise.correlated
     if camera.model == "none":
         return "none"
     unit = "rad" if noise.model == "isotropic" else "on the image plane"
@@ -137,6 +140,7 @@ def _camera(scenario: Scenario) -> str:
         " and ",
         camera.extrinsics_error and f"{number(camera.extrinsics_error)} rad",
         camera.extrinsics_position_error and f"{number(camera.extrinsics_position_error)} m",
+        camera.extrinsics_walk and f"a walk of {number(camera.extrinsics_walk)} rad in a second",
     )
     seen = _joined(
         ", ",
@@ -146,7 +150,19 @@ def _camera(scenario: Scenario) -> str:
         camera.miss_probability and f"misses {number(100 * camera.miss_probability)} %",
     )
     spread = f"{noise.model} noise {number(noise.scale)} {unit}" if noisy else "no noise"
-    return f"{seen}; bearings, {spread}" + (f"; mounted off by {off} per axis" if off and noisy else "")
+    return _joined(
+        "; ",
+        f"{seen}; bearings, {spread}",
+        noisy and correlated.std and f"{number(correlated.std)} rad correlated over {number(correlated.time)} s",
+        off and noisy and f"mounted off by {off} per axis",
+        _late(camera, noisy),
+    )
+
+
+def _late(camera: Camera, noisy: bool) -> str:
+    """Return the age of a camera's frames in words, with the deviations of its errors."""
+    errors = [number(1000.0 * std) for std in (camera.latency_error, camera.latency_jitter) if std and noisy]
+    return f"frames {' +- '.join([number(1000.0 * camera.latency), *errors])} ms old" if camera.is_late else ""
 
 
 def _sensor(section: SensorSection) -> str:

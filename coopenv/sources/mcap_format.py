@@ -38,6 +38,7 @@ EXACT = {
     "v2x": "coopenv_msgs/msg/Inbox",
     "truth_exact": "coopenv_msgs/msg/Truth",
     "pan": "coopenv_msgs/msg/Pan",
+    "bearing_age": "coopenv_msgs/msg/Age",
 }
 """Topics of a vehicle that hold the recording, one message a tick."""
 
@@ -45,6 +46,7 @@ CONTENTS = {
     "increment": {name: name for name in ("rotation", "translation", "velocity", "angular_velocity")},
     "bearings": {},
     "pan": {"angle": "pan"},
+    "bearing_age": {"age": "bearing_age"},
     "v2x": {"tick_sent": "inbox_tick"},
     "truth_exact": {"rotation": "truth.rotation", "position": "truth.position"},
 }

@@ -243,6 +243,8 @@ def model_struct(p: Precision) -> Any:
         latency: scalar  # s, known age of a frame
         latency_std: scalar  # s, of a constant error of `latency`
         latency_jitter: scalar  # s, of one drawn for every frame
+        latency_ticks: wp.int32  # nearest to `latency`
+        changes: wp.int32  # 1: frames have an age, or `rotation` walks
 
     @wp.struct
     class NoiseValues:
@@ -252,6 +254,9 @@ def model_struct(p: Precision) -> Any:
         angular_velocity: scalar  # rad/s
         bearing_paper: wp.int32
         bearing: scalar
+        bearing_correlated: scalar  # rad, standard deviation of a Gauss-Markov process
+        bearing_correlation_time: scalar  # s, of that
+        bearing_counted: scalar  # rad, standard deviation of white noise by which filters count that
         axis: mat33  # columns: image-plane axes and optical axis of the paper's formula, camera frame
         lasting: wp.int32  # 1: any of the errors below is on
         odometry_scale: scalar
@@ -420,6 +425,8 @@ def model_struct(p: Precision) -> Any:
         restarts: wp.int32  # 1: some vehicle may restart
         alters: wp.int32  # 1: some broadcast pose may differ from its sender's estimate
         map_errors: wp.int32  # 1: a landmark may be off on some map
+        past: wp.int32  # ticks of which poses are kept: as old as frames may be
+        correlated: wp.int32  # 1: some vehicle's bearings have a correlated error
         jammers: wp.int32  # 1: some vehicle may carry a jammer
         radio: Radio
         observer: ObserverValues

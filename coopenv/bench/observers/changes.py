@@ -97,6 +97,53 @@ def with_random_bearings(recording: Recording, fault: Fault, seed: int) -> Recor
     return replace(recording, bearings=bearings)
 
 
+def with_reflections(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Mirror the bearings to landmarks at a vertical plane along the vehicle's way, in bursts for a share of the time.
+
+    Bursts are drawn per vehicle and landmark.
+    """
+    K, N, L = recording.ticks, len(recording.setups), recording.landmarks.shape[1]
+    length = max(1, round(fault.options.get("burst", 0.5) / recording.dt))
+    drawn = np.random.default_rng([seed, 4]).random((math.ceil(K / length), N, L)) < fault.value
+    reflected = np.repeat(drawn, length, axis=0)[:K] & _on(recording, fault)[:, None]
+    way = recording.velocity.mean(axis=0)
+    size = np.linalg.norm(way[:, :2], axis=-1, keepdims=True)
+    ahead = np.where(size > 1e-6, way[:, :2] / np.maximum(size, 1e-6), (1.0, 0.0))
+    across = np.stack([-ahead[:, 1], ahead[:, 0], np.zeros(N)], axis=-1)[:, None]  # of the plane, body axes
+    bearings = recording.bearings.copy()
+    seen = bearings[:, :, :L]
+    mirrored = seen - 2.0 * np.sum(seen * across, axis=-1, keepdims=True) * across
+    bearings[:, :, :L] = np.where(reflected[..., None], mirrored, seen)
+    return replace(recording, bearings=bearings)
+
+
+def with_late_frames(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Let frames show the bearings of a time before, interpolated between frames; what has none is not measured."""
+    frames = np.arange(recording.ticks) - fault.value / recording.dt
+    first = np.maximum(np.floor(frames + 1e-9).astype(int), 0)
+    share = np.maximum(frames - first, 0.0)[:, None, None, None]
+    then, after = (recording.bearings[k] for k in (first, np.minimum(first + 1, recording.ticks - 1)))
+    between = np.where(share > 1e-9, (1.0 - share) * then + share * after, then)
+    between /= np.linalg.norm(between, axis=-1, keepdims=True)
+    bearings = np.where(_on(recording, fault)[:, None, None], between, recording.bearings)
+    seen = recording.visible & np.isfinite(bearings).all(axis=-1)
+    return replace(recording, visible=seen, bearings=np.where(seen[..., None], bearings, np.nan))
+
+
+def with_correlated_bearings(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Add a Gauss-Markov error of first order to bearings, drawn per vehicle and target."""
+    generator, time = np.random.default_rng([seed, 5]), fault.options.get("time", 1.0)
+    kept = math.exp(-recording.dt / time) if time > 0.0 else 0.0
+    error = np.zeros(recording.bearings.shape[1:])
+    bearings = recording.bearings.copy()
+    for k in range(recording.ticks):
+        fresh = fault.value * generator.standard_normal(error.shape)
+        error = fresh if k == 0 else kept * error + math.sqrt(1.0 - kept**2) * fresh
+        bearings[k] += error * _on(recording, fault)[:, None, None]
+    bearings /= np.linalg.norm(bearings, axis=-1, keepdims=True)
+    return replace(recording, bearings=bearings)
+
+
 def with_gyro_step(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Add a bias, rad/s, to the vertical axis of gyros from a time on."""
     from coopenv.estimation.poses import about_z  # late: `coopenv list variants` imports this module, and no Numba
@@ -116,6 +163,15 @@ def with_camera_step(recording: Recording, fault: Fault, seed: int) -> Recording
     return replace(recording, bearings=bearings)
 
 
+def with_camera_turn(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Turn cameras on their mountings to the left at a rate, rad/s, from a time on."""
+    from coopenv.estimation.poses import about_z  # late, as above
+
+    since = np.maximum(0.0, recording.t - fault.start_in(float(recording.t[-1])))
+    turn = about_z(fault.value * np.outer(since, _on(recording, fault)))
+    return replace(recording, bearings=recording.bearings @ turn)
+
+
 def with_focal_error(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Let focal lengths be larger than observers know by a share, from a time on."""
     bearings, first, on = recording.bearings.copy(), _first_tick(recording, fault), _on(recording, fault)
@@ -131,6 +187,13 @@ def with_scale_drift(recording: Recording, fault: Fault, seed: int) -> Recording
     start, end = fault.start_in(float(recording.t[-1])), float(recording.t[-1])
     grown = np.maximum(0.0, recording.t - start) / max(end - start, recording.dt)
     scale = (1.0 + fault.value * np.outer(grown, _on(recording, fault)))[..., None]
+    return replace(recording, translation=recording.translation * scale, velocity=recording.velocity * scale)
+
+
+def with_scale_step(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Let odometries have a constant scale error from a time on."""
+    on = np.outer(np.arange(recording.ticks) >= _first_tick(recording, fault), _on(recording, fault))
+    scale = (1.0 + fault.value * on)[..., None]
     return replace(recording, translation=recording.translation * scale, velocity=recording.velocity * scale)
 
 
@@ -185,6 +248,39 @@ def with_map_error(recording: Recording, fault: Fault, seed: int) -> Recording:
     false.map_error[entries] = offset[:, None] * _horizontal(np.broadcast_to(angle, len(marks)))
     false.map_tick[entries] = _first_tick(recording, fault)
     return replace(recording, interference=false)
+
+
+def with_map_noise(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Shift every landmark on all maps by a normally distributed error in each axis."""
+    shape = recording.landmarks.shape[1:]
+    error = fault.value * np.random.default_rng([seed, 7]).standard_normal(shape)
+    return replace(recording, landmarks=recording.landmarks + error)
+
+
+def with_map_exchange(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Exchange the places of two landmarks on all maps, drawn.
+
+    Raises:
+        CoopenvError: there is one landmark or none.
+    """
+    count = recording.landmarks.shape[1]
+    if count < 2:
+        raise CoopenvError(f"fault {fault.text}: needs two landmarks, there {'is one' if count else 'are none'}")
+    pair = np.random.default_rng([seed, 8]).choice(count, 2, replace=False)
+    landmarks = recording.landmarks.copy()
+    landmarks[:, pair] = landmarks[:, pair[::-1]]
+    return replace(recording, landmarks=landmarks)
+
+
+def with_map_speed(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Let a landmark move on all maps from a time on, while it stands, or moves as before; default: one drawn."""
+    names, generator = recording.setups[0].target_names, np.random.default_rng([seed, 9])
+    mark = names.index(fault.word) if fault.word else int(generator.integers(recording.landmarks.shape[1]))
+    angle = fault.options.get("angle", 2.0 * math.pi * generator.random())
+    since = np.maximum(0.0, recording.t - fault.start_in(float(recording.t[-1])))
+    landmarks = recording.landmarks.copy()
+    landmarks[:, mark] += fault.value * since[:, None] * _horizontal(np.array(angle))
+    return replace(recording, landmarks=landmarks)
 
 
 def _horizontal(angle: np.ndarray) -> np.ndarray:

@@ -19,16 +19,24 @@ from coopenv.bench.observers.changes import (
     leaders_of,
     usual_sender,
     with_camera_step,
+    with_camera_turn,
+    with_correlated_bearings,
     with_delay,
     with_focal_error,
     with_gyro_step,
     with_jammer,
+    with_late_frames,
     with_lie,
     with_loss,
     with_map_error,
+    with_map_exchange,
+    with_map_noise,
+    with_map_speed,
     with_prior_error,
     with_random_bearings,
+    with_reflections,
     with_scale_drift,
+    with_scale_step,
     with_sensors,
     with_wrong_association,
     without_landmarks,
@@ -78,6 +86,30 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
     "random_bearings": RecordFault(
         "SHARE", "of the bearings that points in a uniform direction", 0.1, high=1.0, change=with_random_bearings
     ),
+    "reflections": RecordFault(
+        "SHARE",
+        "of the time in which a landmark is seen in a mirror, in bursts of 0.5 s",
+        0.2,
+        high=1.0,
+        options={"burst": (1e-3, LARGEST)},
+        vehicles=True,
+        change=with_reflections,
+    ),
+    "late_frames": RecordFault(
+        "SECONDS",
+        "by which camera frames are older than stated; undeclared",
+        0.03,
+        vehicles=True,
+        change=with_late_frames,
+    ),
+    "correlated_bearings": RecordFault(
+        "STD",
+        "of an error of bearings that lasts for a time, 1 s, rad; undeclared",
+        0.003,
+        options={"time": SIZE},
+        vehicles=True,
+        change=with_correlated_bearings,
+    ),
     "gyro_step": RecordFault(
         "RATE",
         "by which gyros are biased about the vertical from START on, rad/s; undeclared",
@@ -97,6 +129,15 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         vehicles=True,
         change=with_camera_step,
     ),
+    "camera_turn": RecordFault(
+        "RATE",
+        "at which cameras turn to the left on their mountings from START on, rad/s; undeclared",
+        0.002,
+        low=-LARGEST,
+        start=True,
+        vehicles=True,
+        change=with_camera_turn,
+    ),
     "focal_step": RecordFault(
         "SHARE",
         "by which focal lengths are too large from START on; undeclared",
@@ -115,6 +156,15 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         vehicles=True,
         change=with_scale_drift,
     ),
+    "scale_step": RecordFault(
+        "SHARE",
+        "by which odometries read too much from START on; undeclared",
+        0.005,
+        low=-1.0,
+        start=True,
+        vehicles=True,
+        change=with_scale_step,
+    ),
     "landmarks_lost": RecordFault(
         "", "no landmark is visible", 0.0, start=True, duration=True, change=without_landmarks
     ),
@@ -127,6 +177,19 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         options={"angle": ANY, "spread": SIZE},
         vehicles=True,
         change=with_map_error,
+    ),
+    "map_noise": RecordFault(
+        "STD", "of the error of all landmarks on all maps, per axis, m; undeclared", 0.05, change=with_map_noise
+    ),
+    "map_exchange": RecordFault("", "two landmarks are exchanged on all maps", 0.0, change=with_map_exchange),
+    "map_speed": RecordFault(
+        "[LANDMARK:]SPEED",
+        "at which a landmark moves on all maps alone from START on, m/s",
+        0.1,
+        free_word=True,
+        start=True,
+        options={"angle": ANY},
+        change=with_map_speed,
     ),
     "prior_error": RecordFault(
         "METRES",
@@ -312,7 +375,10 @@ def with_world(variant: FaultVariant, scenario: Scenario) -> FaultVariant:
 
 def check_names(fault: Fault, vehicles: Sequence[str], landmarks: Sequence[str]) -> None:
     """Refuse unknown vehicles and landmarks. Raises CoopenvError: it names the known ones."""
-    given = {"vehicle": (fault.vehicles, vehicles), "landmark": ([fault.word] * (fault.name == "map_error"), landmarks)}
+    given = {
+        "vehicle": (fault.vehicles, vehicles),
+        "landmark": ([fault.word] * FAULTS[fault.name].free_word, landmarks),
+    }
     for kind, (names, known) in given.items():
         for name in names:
             if name and name not in known:

@@ -141,7 +141,7 @@ class RenderedWorld(SimulatedWorld):
             where = f"got num_worlds={worlds}, device='{device}'"
             raise CoopenvError(f"sensing: 'images' renders one world on the CPU: num_worlds=1, device='cpu', {where}")
         super().__init__(scenario, worlds, dtype, device, 1, *observer)
-        self._cameras = scenario.cameras
+        self._cameras, self._late = scenario.cameras, self.model.camera.numpy()["latency_ticks"].tolist()
         self._noisy = [noise.enabled for noise in scenario.noises]
         self._renderers = [FrameRenderer(Calibration.of(camera), scenario.images.family) for camera in self._cameras]
 
@@ -187,7 +187,7 @@ class RenderedWorld(SimulatedWorld):
         bearings[...], ticks[...] = bearing, bearing_tick
         for vehicle in np.flatnonzero(visible.any(axis=-1)).tolist():
             for target, ray in self._found(vehicle, tick, np.flatnonzero(visible[vehicle]), exact[vehicle]).items():
-                sight[vehicle, target], ticks[vehicle, target] = Sight.VISIBLE, tick
+                sight[vehicle, target], ticks[vehicle, target] = Sight.VISIBLE, max(tick - self._late[vehicle], 0)
                 bearings[vehicle, target] = ray
 
     def _found(self, vehicle: int, tick: int, visible: NDArray[Any], exact: Array) -> dict[int, Array]:

@@ -46,7 +46,10 @@ SEARCH, RESECTION, TRACKING = 0, 1, 2  # purpose of a frame
 
 @device_function
 def bearing_variance(model: Any, i: int):
-    """Return the variance of a bearing of vehicle i per tangent axis, with that of pixels which are rounded."""
+    """Return the variance of a bearing of vehicle i per tangent axis, with that of pixels which are rounded.
+
+    A correlated error counts as white noise.
+    """
     std = wp.float64(model.noise[i].bearing)
     variance = std * std
     if model.noise[i].bearing_paper == 1:
@@ -54,6 +57,8 @@ def bearing_variance(model: Any, i: int):
     if model.camera[i].quantise == 1:
         focal = wp.float64(wp.min(model.camera[i].focal_length))
         variance += wp.float64(ROUNDING_VARIANCE) / (focal * focal)
+    correlated = wp.float64(model.noise[i].bearing_counted)
+    variance += correlated * correlated
     return wp.max(variance, wp.float64(MIN_BEARING_STD) * wp.float64(MIN_BEARING_STD))
 
 
@@ -244,7 +249,7 @@ def set_bearing_measurements(model: Any, state: Any, memory: Any, world: int, i:
         frame.period = wp.max(since, now.period)
     R = camera_to_body(model, state, world, i)
     frame.axis = vec3d(wp.float64(R[0, 2]), wp.float64(R[1, 2]), wp.float64(R[2, 2]))
-    frame.age = wp.float64(model.camera[i].latency) + memory.member[world, i, ERRORS].v[2]
+    frame.age = wp.float64(state.bearing_age[world, i]) + memory.member[world, i, ERRORS].v[2]
     frame.since.R = wp.identity(3, wp.float64)
     if frame.age != wp.float64(0.0):
         frame.since = motion_since(memory, world, i, frame.age)
