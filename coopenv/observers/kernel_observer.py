@@ -139,7 +139,7 @@ class KernelObserver:
         """The same of the memory."""
         self._now = [wp.zeros(1, dtype=kind, device="cpu") for kind in (wp.int32, wp.float64, wp.int32)]
         self._now_views = [array.numpy() for array in self._now]
-        self._noise_views, self._camera_views = self._model.noise.numpy(), self._model.camera.numpy()
+        self._noise_views = self._model.noise.numpy()
         self._start_covariance = self._model.start.covariance.numpy()[setup.vehicle]
         self._set_clock(None, setup.noise.odometry_period)
         self._received: dict[
@@ -202,7 +202,6 @@ class KernelObserver:
         s = self.state
         for name in ("velocity", "angular_velocity"):
             self._noise_views[name] = getattr(tick.noise, name)
-        self._camera_views["latency"] = tick.bearing_age
         s.increment_rotation[...], s.increment_translation[...] = tick.rotation, tick.translation
         s.odometry_velocity[...], s.odometry_angular_velocity[...] = tick.velocity, tick.angular_velocity
         s.position[: self.setup.landmarks] = tick.landmarks
