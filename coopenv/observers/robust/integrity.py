@@ -99,6 +99,9 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
             if q == FOCAL:
                 for k in range(2):
                     M[k, 0] = M[k, 0] + memory.derivative[world, i, n, 3].jacobian[k, FOCAL_ERROR]
+            if memory.source[world, i, q].map_variance > wp.float64(0.0):  # the errors of all landmarks count
+                share = wp.float64(1.0) / memory.source[world, i, q].map_variance
+                M = share * memory.map_projection[world, i, n, q - 1 - SENDER_SLOTS]
             WM = memory.measurement[world, i, n].weight * M
             weighted = WM
             if memory.measurement[world, i, n].member > 0:  # errors of messages are the same for that time
