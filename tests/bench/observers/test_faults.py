@@ -121,7 +121,9 @@ def test_the_recorded_world_has_the_fault() -> None:
         ("lie=jump,honest_odometry=2", "honest_odometry: expected a whole number from 0 to 1, got '2'"),
         ("lie=replay:1@1,turn=1", "lie: no option 'turn'; allowed: std, honest_odometry"),
         ("lie=jump,std=1,std=2", "'std=2' is not OPTION=VALUE, each option once"),
-        ("nosuch=1", "known: v2x_loss, .*gyro_step, .*29 in all"),
+        ("gyro=offset:1,share=1", "gyro: no option 'share'; allowed: none"),
+        ("gyro=sometimes:1", "unknown gyro 'sometimes'.*offset, ramp, drift, walk, intermittent"),
+        ("nosuch=1", "known: v2x_loss, .*gyro_step, .*31 in all"),
         ("restart@101%", "restart: start: expected a number from 0 to 100, got '101'"),
     ],
 )
@@ -309,7 +311,7 @@ def test_the_scale_error_grows_to_its_value() -> None:
 
 
 def test_a_constant_scale_error_begins_at_its_time() -> None:
-    after, late = changed_by("vehicle_1:scale_step=0.02@2"), made().t >= 2.0 - 1e-9
+    after, late = changed_by("vehicle_1:scale=offset:0.02@2"), made().t >= 2.0 - 1e-9
     for name in ("velocity", "translation"):
         expected = getattr(made(), name).copy()
         expected[late, 0] *= 1.02
@@ -318,7 +320,7 @@ def test_a_constant_scale_error_begins_at_its_time() -> None:
 
 
 def test_cameras_turn_slowly() -> None:
-    after = changed_by("vehicle_2:camera_turn=0.1@2")
+    after = changed_by("vehicle_2:camera=drift:0.1@2")
     turned = Rotation.from_euler("z", -0.1 * 2.0).apply(made().bearings[240, 1].copy())  # 4 s after the start
     assert_allclose(after.bearings[240, 1], turned, atol=1e-9)
     assert_array_equal(after.bearings[:120], made().bearings[:120])
@@ -372,14 +374,35 @@ def test_maps_are_wrong_everywhere() -> None:
     assert_array_equal(exchanged[:, moved], made().landmarks[:, moved[::-1]])
 
 
-def test_a_map_lets_a_landmark_move() -> None:
-    name = made().setups[0].target_names[1]
-    shift = changed_by(f"map_speed={name}:0.5@1,angle=0").landmarks - made().landmarks
+def test_a_landmark_moves_on_maps_alone() -> None:
+    shift = changed_by("landmark=drift:0.5@1,landmark=2,angle=0").landmarks - made().landmarks
     expected = np.zeros_like(shift)
     expected[:, 1, 0] = 0.5 * np.maximum(0.0, made().t - 1.0)
     assert_allclose(shift, expected, atol=1e-12)
-    drawn = changed_by("map_speed=0.5", 4).landmarks - made().landmarks
-    assert (np.abs(drawn[-1]).max(axis=-1) > 0.0).sum() == 1
+    drawn = changed_by("landmark=offset:0.5", 4).landmarks - made().landmarks
+    assert_allclose(np.sort(np.linalg.norm(drawn, axis=-1), axis=1)[:, -2:], [[0.0, 0.5]] * made().ticks)
+    with pytest.raises(CoopenvError, match=r"landmark=offset,landmark=9: landmark: expected a number up to 3, got 9"):
+        changed_by("landmark=offset,landmark=9")
+
+
+def test_an_error_walks_at_random() -> None:
+    """Over time t its variance is the square of its value times t, for each vehicle on its own."""
+    steps = []
+    for seed in range(8):
+        bias = (changed_by("gyro=walk:0.1@1", seed).angular_velocity - made().angular_velocity)[..., 2]
+        assert not bias[made().t < 1.0].any()
+        steps.append(np.diff(bias[60:], axis=0))
+    walked = np.array(steps)
+    assert_allclose(walked.std(), 0.1 * np.sqrt(made().dt), rtol=0.05)
+    assert abs(np.corrcoef(walked[..., 0].ravel(), walked[..., 1].ravel())[0, 1]) < 0.1
+
+
+def test_an_error_comes_and_goes() -> None:
+    bias = changed_by("vehicle_1:gyro=intermittent:0.3@1,share=0.4,burst=0.1", 2).angular_velocity
+    there = (bias - made().angular_velocity)[:, 0, 2].round(9)
+    assert set(there) == {0.0, 0.3} and not there[:60].any()
+    assert 0.2 < np.mean(there[60:] > 0.0) < 0.6
+    assert (np.flatnonzero(np.diff(there)) % 6 == 5).all()  # bursts of six ticks
 
 
 def test_a_share_of_the_bearings_is_random() -> None:
