@@ -2,8 +2,8 @@
 
 Errors are left errors, R = Rhat Exp(theta), p = phat + Rhat rho, six per member, the vehicle itself first. The
 covariance is kept in blocks of 6x6. A member's pose is the one of its last fused report. If a new member needs room,
-the member that has been out of view for longest is evicted. Calibration states of odometry and of the camera's mounting
-are members too.
+the member that has been out of view for longest is evicted. Calibration states are members too: one of the odometry's
+errors, of the focal length and of the latency of frames, and one of the camera's mounting.
 """
 
 from typing import Any
@@ -245,7 +245,7 @@ def odometry_variances(bias: Any, least: wp.float64, scale: Any):
 
 @device_function
 def begin_errors(model: Any, memory: Any, world: int, i: int):
-    """Begin the calibration states of odometry, member 1, and of the mounting, member 2, if its errors are declared."""
+    """Begin the calibration states of odometry and frames, member 1, and of a mounting with errors, member 2."""
     noise = model.noise[i]
     odometry = odometry_variances(noise.gyro_bias, wp.float64(constants.GYRO_BIAS), noise.odometry_scale)
     mounting = mounting_variances(model, i)
@@ -355,9 +355,9 @@ def jump_variance(change: Any, std: Any, period: Any):
 def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: Any):
     """Return the increment over a tick of dt and variances to add to its noise; propagate the dead reckoning.
 
-    The recent mean twist is stored for `errors_transition` and `approach`. Samples are held until the next one, so that their sum
-    lags by half a period. Half the change of the held sample makes it the trapezoidal rule: (v0 + v1) T / 2 = v0 T +
-    (v1 - v0) T / 2. The next sample removes the noise that this adds.
+    The recent mean twist is stored for `errors_transition` and `approach`. Samples are held until the next one, so that
+    their sum lags by half a period. Half the change of the held sample makes it the trapezoidal rule: (v0 + v1) T / 2 =
+    v0 T + (v1 - v0) T / 2. The next sample removes the noise that this adds.
     """
     v = vec3d(state.odometry_velocity[world, i])
     w = vec3d(state.odometry_angular_velocity[world, i])

@@ -34,8 +34,7 @@ def tangent_basis(b: Any):
 def approach(memory: Any, world: int, i: int, member: int, turn: Any, point: Any, a: Any):
     """Return the velocity (m/s, body) at which a target at `a` (m, body) approaches.
 
-    The twist is the mean of a second: by that of a sample, noise would seem to tell the latency, see
-    `errors_transition`.
+    The twist is the mean of a second: noise of a sample would make the latency observable, see `errors_transition`.
     """
     velocity = memory.belief[world, i].mean_v + wp.cross(memory.belief[world, i].mean_w, a)
     if member > 0:

@@ -290,7 +290,7 @@ def memory_struct(entries: str, of_reading: Any, name: str = "RobustMemory") -> 
         measurement: array("WL" + entries, BearingMeasurement)
         derivative: array(
             "WL" + entries + "J", Derivative
-        )  # of a bearing: by the errors of oneself, target, mounting, focal length
+        )  # of a bearing: by the errors of oneself, target, mounting, focal length and latency
         scratch: array("WLK", Scratch)
         projection: array("WL" + entries + "K", mat26d)  # H P, of a bearing and a member, see correction.py
         outbox_correlation: array("WNSC", Correlation)
@@ -308,7 +308,7 @@ def memory_struct(entries: str, of_reading: Any, name: str = "RobustMemory") -> 
 RobustMemory, RobustMemoryWithReadings = memory_struct("X", Nothing), memory_struct("F", FusedReading)
 
 
-ERRORS = 1  # the member that stands for the errors of odometry and of the focal length, see joint_state.py
+ERRORS = 1  # the member that stands for the errors of odometry and frames, see joint_state.py
 FOCAL_ERROR, LATENCY_ERROR = 4, 5  # those of the focal length and of the latency among these errors
 MOUNTING = 2  # the member that stands for the error of the camera's mounting, where there is one, see joint_state.py
 DERIVATIVES = 4  # the most errors that a bearing depends on
