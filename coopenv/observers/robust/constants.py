@@ -27,6 +27,9 @@ MAX_ITERATIONS = 8  # of one correction, and of the least squares from one frame
 LINEAR_ANGLE = 0.05
 """Largest turn (rad) of a line of sight without another linearisation, and largest standard deviation of a sender's
 position, as an angle in view, for which its increments are applied. Tuned."""
+NOTICEABLE_TURN = LINEAR_ANGLE**2
+"""Turn (rad) of a line of sight by a correction from which on the measurements are linearised again: as large as the
+second-order error of a turn that counts as linear."""
 LINEARISATION_TIME, CONSIDERED_LINEARISATION_TIME = 0.1, 12.0
 """Correlation time of a bearing's linearisation error, s; all frames of that time count as one: for a
 landmark, and for another vehicle, whose error no later bearing corrects. Tuned."""

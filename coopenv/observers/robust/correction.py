@@ -8,7 +8,7 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import by_rows, displaced, recentring, transposed_by_rows
 from coopenv.observers.robust.joint_state import apply_corrections, set_block
 from coopenv.observers.robust.linearisation import innovation_cross_covariance, innovation_weight, linearise, project
-from coopenv.observers.robust.memory import DERIVATIVES, ERRORS, BearingFrame, mat66d, vec6d
+from coopenv.observers.robust.memory import DERIVATIVES, ERRORS, LANDMARK_SLOTS, BearingFrame, mat66d, vec6d
 from coopenv.world.warp_internals import device_function, subroutine
 
 
@@ -47,6 +47,10 @@ def set_projection(memory: Any, world: int, i: int, n: int):
                 memory.projection[world, i, n, k] = (
                     memory.projection[world, i, n, k] - share * memory.projection[world, i, m, k]
                 )
+            if memory.belief[world, i].map_errors == 1:
+                for slot in range(LANDMARK_SLOTS):
+                    left = memory.map_projection[world, i, n, slot] - share * memory.map_projection[world, i, m, slot]
+                    memory.map_projection[world, i, n, slot] = left
     memory.measurement[world, i, n].weight = innovation_weight(
         memory, world, i, n, memory.measurement[world, i, n].noise
     )
@@ -154,12 +158,15 @@ def turn_of_sight(memory: Any, world: int, i: int, bearings: int, share: Any, la
 def next_share(memory: Any, world: int, i: int, bearings: int, first: bool):
     """Return the share of the correction at which to linearise next, 0 if that is near the last linearisation point.
 
-    The share is 1 if the correction turns a line of sight far, else 0.5.
+    The share is 1 if the correction turns a line of sight far, else 0.5; 0 if it turns none noticeably.
     """
     one = wp.float64(1.0)
-    far = turn_of_sight(memory, world, i, bearings, one, wp.float64(0.0)) >= wp.float64(constants.LINEAR_ANGLE)
-    share = wp.where(far, one, wp.float64(0.5))
-    if not first:
+    turn = turn_of_sight(memory, world, i, bearings, one, wp.float64(0.0))
+    share = wp.where(turn >= wp.float64(constants.LINEAR_ANGLE), one, wp.float64(0.5))
+    if first:
+        if turn < wp.float64(constants.NOTICEABLE_TURN):
+            share = wp.float64(0.0)
+    else:
         if turn_of_sight(memory, world, i, bearings, share, one) < wp.float64(constants.LINEAR_ANGLE):
             share = wp.float64(0.0)
     return share
@@ -168,6 +175,8 @@ def next_share(memory: Any, world: int, i: int, bearings: int, first: bool):
 @subroutine
 def iterated_update(frame: BearingFrame, memory: Any, world: int, i: int):
     """Correct by the bearings that fit, linearised at half of a small correction, or after all of a large one.
+
+    A correction that turns no line of sight by `NOTICEABLE_TURN` is applied as it is.
 
     For a large correction these are Gauss-Newton steps. For a small one, gain and innovation depend on the same noise:
     two vehicles with little relative motion estimate their range with a bias. The point of linearisation changes it

@@ -36,7 +36,15 @@ from coopenv.observers.robust.joint_state import (
     set_block,
 )
 from coopenv.observers.robust.measurements import is_received
-from coopenv.observers.robust.memory import Member, Pose, PoseEstimate, mat66d, vec6d
+from coopenv.observers.robust.memory import (
+    LANDMARK_SLOTS,
+    SENDER_SLOTS,
+    Member,
+    Pose,
+    PoseEstimate,
+    mat66d,
+    vec6d,
+)
 from coopenv.observers.robust.messages import bit_of, depends_on_own, includes, propagate_member
 from coopenv.observers.robust.sources import clear_drift, clear_source, is_excluded, is_seen, take_slot
 from coopenv.world.nearby import box_of, box_of_entry, entry_at, entry_count, sender_of
@@ -99,12 +107,31 @@ def add_member(model: Any, state: Any, memory: Any, world: int, i: int, sender: 
         memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
 
 
+@device_function
+def correct_sensitivities(memory: Any, world: int, i: int, inverse: Any):
+    """Correct the sensitivities to errors of the map by an increment of inverse covariance `inverse`.
+
+    As a measurement of the own error that does not depend on the map; otherwise the estimated errors would
+    depend on it more than their covariance allows.
+    """
+    H = memory.scratch[world, i, 0].column * algebra.inverse6(memory.P[world, i, 0, 0])
+    for slot in range(LANDMARK_SLOTS):
+        q = 1 + SENDER_SLOTS + slot
+        if memory.source[world, i, q].map_variance > wp.float64(0.0):
+            weighted = inverse * (H * memory.sensitivity[world, i, q, 0])
+            for k in range(memory.belief[world, i].first_sender):
+                change = wp.transpose(memory.scratch[world, i, k].column) * weighted
+                memory.sensitivity[world, i, q, k] = memory.sensitivity[world, i, q, k] - change
+
+
 @subroutine
 def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any):
     """Correct the own pose by a sender's increment d. `scratch.column` holds cov(d, y) for errors y, `known` cov(d)."""
     members = memory.belief[world, i].members
     first_sender = memory.belief[world, i].first_sender
     inverse = algebra.inverse6(memory.known[world, i, 0].covariance)
+    if memory.belief[world, i].map_errors == 1:
+        correct_sensitivities(memory, world, i, inverse)
     for k in range(first_sender):
         gain = wp.transpose(memory.scratch[world, i, k].column) * inverse
         memory.scratch[world, i, k].correction = gain * d

@@ -93,8 +93,8 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
             M = H * own
             if frame.mounting > 0:
                 M = M + memory.derivative[world, i, n, 2].jacobian * mounting
-            if frame.focal > 0:
-                M = M + memory.derivative[world, i, n, 3].jacobian * memory.sensitivity[world, i, q, frame.focal]
+            if frame.errors > 0:
+                M = M + memory.derivative[world, i, n, 3].jacobian * memory.sensitivity[world, i, q, frame.errors]
             if memory.measurement[world, i, n].source == q:
                 M = M - H[:, 3:] * turn
             if q == CAMERA:
@@ -102,6 +102,9 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
             if q == FOCAL:
                 for k in range(2):
                     M[k, 0] = M[k, 0] + memory.derivative[world, i, n, 3].jacobian[k, FOCAL_ERROR]
+            if memory.source[world, i, q].map_variance > wp.float64(0.0):  # the errors of all landmarks count
+                share = wp.float64(1.0) / memory.source[world, i, q].map_variance
+                M = share * memory.map_projection[world, i, n, q - 1 - SENDER_SLOTS]
             WM = memory.measurement[world, i, n].weight * M
             weighted = WM
             if memory.measurement[world, i, n].member > 0:  # errors of messages are the same for that time
@@ -137,8 +140,8 @@ def correct_drift_effect(frame: BearingFrame, memory: Any, world: int, i: int, q
             r = memory.derivative[world, i, n, 0].jacobian * memory.drift_effect[world, i, q - 1, 0]
             if frame.mounting > 0:
                 r = r + memory.derivative[world, i, n, 2].jacobian * memory.drift_effect[world, i, q - 1, MOUNTING]
-            if frame.focal > 0:
-                r = r + memory.derivative[world, i, n, 3].jacobian * memory.drift_effect[world, i, q - 1, frame.focal]
+            if frame.errors > 0:
+                r = r + memory.derivative[world, i, n, 3].jacobian * memory.drift_effect[world, i, q - 1, frame.errors]
             if memory.measurement[world, i, n].source == q:
                 r = r - memory.derivative[world, i, n, 0].jacobian[:, 3:] * f
             weighted = memory.measurement[world, i, n].weight * r

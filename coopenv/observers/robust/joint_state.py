@@ -2,8 +2,8 @@
 
 Errors are left errors, R = Rhat Exp(theta), p = phat + Rhat rho, six per member, the vehicle itself first. The
 covariance is kept in blocks of 6x6. A member's pose is the one of its last fused report. If a new member needs room,
-the member that has been out of view for longest is evicted. Calibration states of odometry and of the camera's mounting
-are members too.
+the member that has been out of view for longest is evicted. Calibration states are members too: one of the odometry's
+errors, of the focal length and of the latency of frames, and one of the camera's mounting.
 """
 
 from typing import Any
@@ -245,15 +245,15 @@ def odometry_variances(bias: Any, least: wp.float64, scale: Any):
 
 @device_function
 def begin_errors(model: Any, memory: Any, world: int, i: int):
-    """Begin the calibration states of odometry, member 1, and of the mounting, member 2, if its errors are declared."""
+    """Begin the calibration states of odometry and frames, member 1, and of a mounting with errors, member 2."""
     noise = model.noise[i]
     odometry = odometry_variances(noise.gyro_bias, wp.float64(constants.GYRO_BIAS), noise.odometry_scale)
     mounting = mounting_variances(model, i)
     focal = wp.float64(model.camera[i].focal_std)
-    one = wp.float64(1.0)  # an entry without a state is arbitrary
-    variances = vec6d(odometry[0], odometry[1], odometry[2], odometry[3], focal * focal, one)
+    latency = wp.float64(model.camera[i].latency_std)
+    variances = vec6d(odometry[0], odometry[1], odometry[2], odometry[3], focal * focal, latency * latency)
     begin_calibration(memory, world, i, ERRORS, variances)
-    if wp.max(mounting) > wp.float64(0.0):
+    if wp.max(mounting) + wp.float64(model.camera[i].orientation_walk) > wp.float64(0.0):
         variances = vec6d(mounting[0], mounting[0], mounting[0], mounting[1], mounting[1], mounting[1])
         begin_calibration(memory, world, i, MOUNTING, variances)
 
@@ -262,7 +262,8 @@ def begin_errors(model: Any, memory: Any, world: int, i: int):
 def walk_errors(model: Any, memory: Any, world: int, i: int, dt: Any):
     """Inflate the covariances of the calibration states by their walk over dt.
 
-    Odometry errors walk as declared and as estimated, see `SourceMonitor`; the mounting: see `CALIBRATION_CHANGE`.
+    Errors walk as declared; the odometry's scale also as estimated, see `SourceMonitor`, and the mounting by
+    `CALIBRATION_CHANGE`.
     """
     noise = model.noise[i]
     walk = odometry_variances(noise.gyro_bias_walk, wp.float64(constants.GYRO_BIAS_WALK), noise.odometry_scale_walk)
@@ -271,8 +272,11 @@ def walk_errors(model: Any, memory: Any, world: int, i: int, dt: Any):
         memory.P[world, i, ERRORS, ERRORS][k, k] += walk[k] * dt
     if mounting_of(memory, world, i) > 0:
         share = wp.float64(constants.CALIBRATION_CHANGE * constants.CALIBRATION_CHANGE) * dt
+        gained = share * mounting_variances(model, i)
+        turning = wp.float64(model.camera[i].orientation_walk)
+        gained[0] += turning * turning * dt
         P = memory.P[world, i, MOUNTING, MOUNTING]
-        memory.P[world, i, MOUNTING, MOUNTING] = with_noise(P, share * mounting_variances(model, i))
+        memory.P[world, i, MOUNTING, MOUNTING] = with_noise(P, gained)
 
 
 @device_function
@@ -351,9 +355,9 @@ def jump_variance(change: Any, std: Any, period: Any):
 def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: Any):
     """Return the increment over a tick of dt and variances to add to its noise; propagate the dead reckoning.
 
-    The recent mean velocity is stored for `errors_transition`. Samples are held until the next one, so that their sum
-    lags by half a period. Half the change of the held sample makes it the trapezoidal rule: (v0 + v1) T / 2 = v0 T +
-    (v1 - v0) T / 2. The next sample removes the noise that this adds.
+    The recent mean twist is stored for `errors_transition` and `approach`. Samples are held until the next one, so that
+    their sum lags by half a period. Half the change of the held sample makes it the trapezoidal rule: (v0 + v1) T / 2 =
+    v0 T + (v1 - v0) T / 2. The next sample removes the noise that this adds.
     """
     v = vec3d(state.odometry_velocity[world, i])
     w = vec3d(state.odometry_angular_velocity[world, i])
@@ -371,8 +375,10 @@ def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: A
         noise[1] = jump_variance(change_v, wp.float64(model.noise[i].velocity), period)
         share = dt / (dt + wp.float64(constants.MEAN_TIME))
         memory.belief[world, i].mean_v += share * (v - memory.belief[world, i].mean_v)
+        memory.belief[world, i].mean_w += share * (w - memory.belief[world, i].mean_w)
     else:
         memory.belief[world, i].mean_v = v
+        memory.belief[world, i].mean_w = w
     memory.belief[world, i].has_sample = 1
     memory.belief[world, i].sample_v = v
     memory.belief[world, i].sample_w = w

@@ -8,7 +8,17 @@ from coopenv.estimation.linalg import skew
 from coopenv.measurements.bearing import axes_across
 from coopenv.observers.robust.algebra import by_rows
 from coopenv.observers.robust.measurements import linearisation_variance
-from coopenv.observers.robust.memory import FOCAL_ERROR, BearingFrame, Derivative, Pose, mat26d, vec3d
+from coopenv.observers.robust.memory import (
+    FOCAL_ERROR,
+    LANDMARK_SLOTS,
+    LATENCY_ERROR,
+    SENDER_SLOTS,
+    BearingFrame,
+    Derivative,
+    Pose,
+    mat26d,
+    vec3d,
+)
 from coopenv.observers.robust.readings import is_reading, linearise_reading
 from coopenv.world.warp_internals import device_function, subroutine
 
@@ -18,6 +28,19 @@ def tangent_basis(b: Any):
     """Return two orthonormal rows (2, 3) across a unit vector."""
     first, second = axes_across(b)
     return wp.matrix_from_rows(first, second)
+
+
+@device_function
+def approach(memory: Any, world: int, i: int, member: int, turn: Any, point: Any, a: Any):
+    """Return the velocity (m/s, body) at which a target at `a` (m, body) approaches.
+
+    The twist is the mean of a second: noise of a sample would make the latency observable, see `errors_transition`.
+    """
+    velocity = memory.belief[world, i].mean_v + wp.cross(memory.belief[world, i].mean_w, a)
+    if member > 0:
+        moving = memory.member[world, i, member].v + wp.cross(memory.member[world, i, member].w, point)
+        velocity = velocity - turn * moving
+    return velocity
 
 
 @subroutine
@@ -36,7 +59,8 @@ def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
         z = theirs.p + theirs.R * point
         turn = wp.transpose(own.R) * theirs.R
     a = wp.transpose(own.R) * (z - own.p)
-    d = a - frame.lever
+    back = wp.transpose(frame.since.R)
+    d = back * (a - frame.since.p) - frame.lever
     mounting = Pose(wp.identity(3, wp.float64), vec3d())
     if frame.mounting > 0:
         mounting = memory.member[world, i, frame.mounting].pose
@@ -49,14 +73,16 @@ def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     predicted = wp.transpose(mounting.R) * u
     cosine = wp.dot(frame.axis, predicted)
     away = cosine * (cosine * predicted - frame.axis)
-    if frame.focal > 0:
-        bearing = wp.normalize(bearing - memory.member[world, i, frame.focal].v[1] * away)
+    if frame.errors > 0:
+        bearing = wp.normalize(bearing - memory.member[world, i, frame.errors].v[1] * away)
     bearing = mounting.R * bearing
     T = tangent_basis(u)
-    B = T * inverse
+    at_exposure = T * inverse
+    B = at_exposure * back
     H = mat26d()
     H[:, :3] = B * skew(a)
     H[:, 3:] = -B
+    memory.measurement[world, i, n].by_map = B * wp.transpose(own.R)
     memory.derivative[world, i, n, 0] = Derivative(0, H)
     memory.derivative[world, i, n, 1].member = wp.where(member > 0, member, -1)
     if member > 0:
@@ -66,16 +92,19 @@ def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
         memory.derivative[world, i, n, 1].jacobian = H
     memory.derivative[world, i, n, 2].member = wp.where(frame.mounting > 0, frame.mounting, -1)
     H[:, :3] = T * mounting.R * skew(memory.measurement[world, i, n].bearing)
-    H[:, 3:] = -(B * mounting.R)
+    H[:, 3:] = -(at_exposure * mounting.R)
     memory.derivative[world, i, n, 2].jacobian = H
-    memory.derivative[world, i, n, 3].member = wp.where(frame.focal > 0, frame.focal, -1)
+    by_age = B * approach(memory, world, i, member, turn, point, a)
+    memory.derivative[world, i, n, 3].member = wp.where(frame.errors > 0, frame.errors, -1)
     H = mat26d()
     H[:, FOCAL_ERROR] = T * (mounting.R * away)
+    H[:, LATENCY_ERROR] = by_age
     memory.derivative[world, i, n, 3].jacobian = H
     memory.measurement[world, i, n].residual = T * bearing
     memory.measurement[world, i, n].distance = distance
-    remainder = linearisation_variance(memory, world, i, member, turn, u, distance, frame.period)
+    remainder = linearisation_variance(memory, world, i, n, turn, u, distance, frame.period)
     variance = frame.variance + memory.measurement[world, i, n].variance * inverse * inverse + remainder
+    variance += frame.jitter * wp.length_sq(by_age)
     memory.measurement[world, i, n].noise = variance
     return wp.dot(u, bearing) > wp.float64(0.0)
 
@@ -86,16 +115,46 @@ def project(memory: Any, world: int, i: int, n: int):
     H = memory.derivative[world, i, n, 0].jacobian
     member = memory.derivative[world, i, n, 1].member
     mounting = memory.derivative[world, i, n, 2].member
-    focal = memory.derivative[world, i, n, 3].member
+    errors = memory.derivative[world, i, n, 3].member
     for k in range(memory.belief[world, i].members):
         rows = by_rows(H, memory.P[world, i, 0, k])
         if member > 0:
             rows = rows + by_rows(memory.derivative[world, i, n, 1].jacobian, memory.P[world, i, member, k])
         if mounting > 0:
             rows = rows + by_rows(memory.derivative[world, i, n, 2].jacobian, memory.P[world, i, mounting, k])
-        if focal > 0:
-            rows = rows + by_rows(memory.derivative[world, i, n, 3].jacobian, memory.P[world, i, focal, k])
+        if errors > 0:
+            rows = rows + by_rows(memory.derivative[world, i, n, 3].jacobian, memory.P[world, i, errors, k])
         memory.projection[world, i, n, k] = rows
+    if memory.belief[world, i].map_errors == 1:
+        project_on_map(memory, world, i, n)
+
+
+@subroutine
+def project_on_map(memory: Any, world: int, i: int, n: int):
+    """Set a measurement's `map_projection`, and add the landmark's error on the map to its `projection`.
+
+    That error f is considered: its covariance with the estimated errors is their sensitivity to f, which integrity.py
+    carries on, times the variance of f.
+    Source: Schmidt, Application of state-space methods to navigation problems, Advances in Control Systems 3, 1966.
+    """
+    source = memory.measurement[world, i, n].source
+    mounting = memory.derivative[world, i, n, 2].member
+    errors = memory.derivative[world, i, n, 3].member
+    for slot in range(LANDMARK_SLOTS):
+        q = 1 + SENDER_SLOTS + slot
+        M = memory.derivative[world, i, n, 0].jacobian * memory.sensitivity[world, i, q, 0]
+        if mounting > 0:
+            M = M + memory.derivative[world, i, n, 2].jacobian * memory.sensitivity[world, i, q, mounting]
+        if errors > 0:
+            M = M + memory.derivative[world, i, n, 3].jacobian * memory.sensitivity[world, i, q, errors]
+        variance = memory.source[world, i, q].map_variance
+        if source == q:
+            M = M + memory.measurement[world, i, n].by_map
+            weighted = variance * memory.measurement[world, i, n].by_map
+            for k in range(memory.belief[world, i].first_sender):
+                rows = weighted * wp.transpose(memory.sensitivity[world, i, q, k])
+                memory.projection[world, i, n, k] = memory.projection[world, i, n, k] + rows
+        memory.map_projection[world, i, n, slot] = variance * M
 
 
 @device_function
@@ -108,9 +167,13 @@ def innovation_cross_covariance(memory: Any, world: int, i: int, n: int, m: int)
     mounting = memory.derivative[world, i, n, 2].member
     if mounting > 0:
         S = S + memory.derivative[world, i, n, 2].jacobian * wp.transpose(memory.projection[world, i, m, mounting])
-    focal = memory.derivative[world, i, n, 3].member
-    if focal > 0:
-        S = S + memory.derivative[world, i, n, 3].jacobian * wp.transpose(memory.projection[world, i, m, focal])
+    errors = memory.derivative[world, i, n, 3].member
+    if errors > 0:
+        S = S + memory.derivative[world, i, n, 3].jacobian * wp.transpose(memory.projection[world, i, m, errors])
+    if memory.belief[world, i].map_errors == 1:
+        slot = memory.measurement[world, i, n].source - 1 - SENDER_SLOTS
+        if slot >= 0:
+            S = S + memory.measurement[world, i, n].by_map * wp.transpose(memory.map_projection[world, i, m, slot])
     return S
 
 

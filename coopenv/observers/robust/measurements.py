@@ -18,12 +18,14 @@ from coopenv.observers.robust.algebra import (
     odometry_noise,
     position_variance,
 )
-from coopenv.observers.robust.joint_state import index_of, mounting_of, mounting_variances
+from coopenv.observers.robust.joint_state import corrected, index_of, mounting_of, mounting_variances
 from coopenv.observers.robust.memory import (
     ERRORS,
     FOCAL_ERROR,
+    LATENCY_ERROR,
     MOUNTING,
     BearingFrame,
+    Pose,
     mat66d,
     vec3d,
 )
@@ -101,10 +103,40 @@ def received_variance(model: Any, memory: Any, world: int, i: int, box: int, fra
     variance = position_variance(memory.inbox[world, i, box].P) * wp.float64(THIRD)
     age = wp.float64(frame.tick - memory.inbox[world, i, box].tick) * model.camera_period
     gone = possible_speed(memory, world, i) * age
+    return factor_in_search(memory, world, i, frame) * (variance + gone * gone)
+
+
+@device_function
+def factor_in_search(memory: Any, world: int, i: int, frame: BearingFrame):
+    """Return the factor of a variance of a position of which the error is the same in all frames of a search."""
     factor = wp.float64(constants.SQUARED_MARGIN)
     if memory.search[world, i].hypotheses > 0:
         factor = wp.max(factor, wp.float64(constants.MEAN_TIME) / frame.period)
-    return factor * (variance + gone * gone)
+    return factor
+
+
+@device_function
+def set_mapped_point(model: Any, state: Any, memory: Any, world: int, i: int, frame: BearingFrame, target: int):
+    """Set the point, the source and the accuracy of the frame's next bearing, one to a landmark.
+
+    Of tracked landmarks, the error on the map is considered, see `project`. Otherwise it counts as noise that is the
+    same in several frames.
+    """
+    point = vec3d(mapped_position(model, state, world, i, target))
+    std = wp.float64(model.landmark_std[target])
+    variance = std * std
+    q = int(-1)
+    if frame.purpose == TRACKING:
+        q = take_slot(memory, world, i, target, frame.tick, True, model.camera_period)
+        if q >= 0:
+            memory.source[world, i, q].map_variance = variance
+            variance = wp.float64(0.0)
+        else:
+            variance *= frames_in(wp.float64(constants.CONSIDERED_LINEARISATION_TIME), frame.period)
+    elif frame.purpose == SEARCH:
+        variance *= factor_in_search(memory, world, i, frame)
+    set_bearing_measurement(memory, world, i, frame.bearings, 0, vec3d(), point, variance)
+    memory.measurement[world, i, frame.bearings].source = q
 
 
 @wp.func
@@ -135,10 +167,11 @@ def set_measurement_of_member(
         passed = wp.float64(memory.inbox[world, i, box].tick - stands) * model.camera_period
         variance = odometry_noise(model, i, passed)[1]
         stands = memory.inbox[world, i, box].tick
-    age = wp.float64(frame.tick - stands) * model.camera_period
-    if age > wp.float64(0.0):
+    age = wp.float64(frame.tick - stands) * model.camera_period - frame.age
+    if age != wp.float64(0.0):
         away = wp.float64(HALF_ACCELERATION) * age * age
-        variance += odometry_noise(model, i, age)[1] * frames_in(age, frame.period) + away * away
+        time = wp.abs(age)
+        variance += odometry_noise(model, i, time)[1] * frames_in(time, frame.period) + away * away
         if memory.member[world, i, member].has_twist == 0:
             if frame.purpose == TRACKING:
                 return False
@@ -166,11 +199,8 @@ def set_measurement_of_target(
     if frame.purpose == SEARCH and is_excluded(memory, world, i, slot_of(memory, world, i, target)):
         return False
     if sender < 0:
-        point = vec3d(mapped_position(model, state, world, i, target))
-        set_bearing_measurement(memory, world, i, frame.bearings, 0, b, point, wp.float64(0.0))
-        if frame.purpose == TRACKING:
-            q = take_slot(memory, world, i, target, frame.tick, True, model.camera_period)
-            memory.measurement[world, i, frame.bearings].source = q
+        set_mapped_point(model, state, memory, world, i, frame, target)
+        memory.measurement[world, i, frame.bearings].bearing = b
         return True
     box = box_of_entry(model, entry)
     received = is_received(model, state, memory, world, i, box, frame.tick)
@@ -193,6 +223,15 @@ def set_measurement_of_target(
     return usable
 
 
+@device_function
+def motion_since(memory: Any, world: int, i: int, age: Any):
+    """Return the vehicle's motion from now back to a time `age` (s) before, at its last twist."""
+    turn = memory.belief[world, i].sample_w * age
+    step = exp_so3(wp.float64(0.5) * turn) * memory.belief[world, i].sample_v * age
+    there = corrected(memory, world, i, Pose(exp_so3(turn), step), age)
+    return between(there, Pose(wp.identity(3, wp.float64), vec3d()))
+
+
 @subroutine
 def set_bearing_measurements(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, purpose: int):
     """Set the usable bearings to landmarks and vehicles as measurements, and return their frame.
@@ -210,49 +249,80 @@ def set_bearing_measurements(model: Any, state: Any, memory: Any, world: int, i:
         frame.period = wp.max(since, now.period)
     R = camera_to_body(model, state, world, i)
     frame.axis = vec3d(wp.float64(R[0, 2]), wp.float64(R[1, 2]), wp.float64(R[2, 2]))
+    frame.age = wp.float64(state.bearing_age[world, i]) + memory.member[world, i, ERRORS].v[2]
+    frame.since.R = wp.identity(3, wp.float64)
+    if frame.age != wp.float64(0.0):
+        frame.since = motion_since(memory, world, i, frame.age)
+    jitter = wp.float64(model.camera[i].latency_jitter)
+    frame.jitter = jitter * jitter
     focal = memory.P[world, i, ERRORS, ERRORS][FOCAL_ERROR, FOCAL_ERROR]
+    latency = memory.P[world, i, ERRORS, ERRORS][LATENCY_ERROR, LATENCY_ERROR]
     if purpose == TRACKING:
         frame.mounting = mounting_of(memory, world, i)
-        frame.focal = wp.where(focal > wp.float64(constants.MIN_VARIANCE), ERRORS, 0)
+        frame.errors = wp.where(wp.max(focal, latency) > wp.float64(constants.MIN_VARIANCE), ERRORS, 0)
     else:
         frame.variance += mounting_variances(model, i)[0] + wp.float64(MOST_FOCAL_EFFECT) * focal
+        frame.jitter += latency
     kept = model.kept
     for n in range(entry_count(model, state, world, i)):
         entry = entry_at(model, state, kept, world, i, n)
         if state.sight[world, i, entry] == VISIBLE:
             if set_measurement_of_target(model, state, memory, world, i, frame, entry):
                 frame.bearings += 1
+    frame.jitter *= wp.float64(frame.bearings)  # it is the same for all of them
     return frame
 
 
 @device_function
-def linearisation_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: Any, distance: Any, period: Any):
-    """Return the variance of a bearing's second-order linearisation error, rad^2.
+def map_variance_of(memory: Any, world: int, i: int, n: int):
+    """Return the variance of the n-th measurement's landmark on the map that is considered, m^2 per axis."""
+    q = memory.measurement[world, i, n].source
+    variance = wp.float64(0.0)
+    if memory.belief[world, i].map_errors == 1 and q >= 0:
+        variance = memory.source[world, i, q].map_variance
+    return variance
+
+
+@device_function
+def linearisation_variance(memory: Any, world: int, i: int, n: int, turn: Any, u: Any, distance: Any, period: Any):
+    """Return the variance of the n-th bearing's second-order linearisation error, rad^2.
 
     With errors s of the relative position along the line of sight u and t across it, the direction is t / (d + s). Its
     term t s / d^2 is not linear. That error is correlated over a time, so that all frames of that time, one every
     `period`, count as one. `turn` rotates from the member's body to the vehicle's.
     """
-    along, across = relative_spread(memory, world, i, member, turn, u)
+    along, across = relative_spread(memory, world, i, n, turn, u)
     square = distance * distance
-    return linearised_frames(member, period) * along * across / (square * square)
+    return linearised_frames(memory, world, i, n, period) * along * across / (square * square)
 
 
 @device_function
-def linearised_frames(member: int, period: Any):
-    """Return how many frames have the same linearisation error of a measurement of a member, or of the map (0)."""
+def linearised_frames(memory: Any, world: int, i: int, n: int, period: Any):
+    """Return how many frames have the same linearisation error of the n-th measurement."""
     time = wp.float64(constants.LINEARISATION_TIME)
-    if member > 0:
+    considered = memory.measurement[world, i, n].member > 0
+    if considered or map_variance_of(memory, world, i, n) > wp.float64(0.0):
         time = wp.float64(constants.CONSIDERED_LINEARISATION_TIME)
     return frames_in(time, period)
 
 
 @device_function
-def relative_spread(memory: Any, world: int, i: int, member: int, turn: Any, u: Any):
-    """Return the variances, m^2, of a relative position along a direction u and, of both axes together, across it."""
+def relative_spread(memory: Any, world: int, i: int, n: int, turn: Any, u: Any):
+    """Return the variances, m^2, of the n-th target's relative position along a direction u, and across it.
+
+    The latter is the sum of two axes.
+    """
+    member = memory.measurement[world, i, n].member
     V = block3(memory.P[world, i, 0, 0], 3, 3)
-    along = wp.dot(u, V * u)
-    total = wp.trace(V)
+    latency = memory.P[world, i, ERRORS, ERRORS][LATENCY_ERROR, LATENCY_ERROR]
+    if latency > wp.float64(constants.MIN_VARIANCE):  # at the exposure
+        v = memory.belief[world, i].mean_v
+        c = memory.P[world, i, ERRORS, 0][LATENCY_ERROR]
+        common = wp.outer(v, vec3d(c[3], c[4], c[5]))
+        V = V - common - wp.transpose(common) + latency * wp.outer(v, v)
+    mapped = map_variance_of(memory, world, i, n)
+    along = wp.dot(u, V * u) + mapped
+    total = wp.trace(V) + wp.float64(3.0) * mapped
     if member > 0:
         # of V + turn W turn^T - C turn^T - turn C^T
         W = block3(memory.P[world, i, member, member], 3, 3)

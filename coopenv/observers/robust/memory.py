@@ -66,7 +66,7 @@ class Member:
     box: wp.int32  # of its messages at this tick, see `coopenv.world.nearby`
     pose: Pose
     has_twist: wp.int32
-    v: vec3d  # m/s, body; of the errors of odometry and lens: (scale, relative focal length, 0)
+    v: vec3d  # m/s, body; of the errors of odometry and frames: (scale, relative focal length, latency in s)
     w: vec3d  # rad/s, body; of the odometry's errors: the gyro's bias
     clock_v: vec3d  # m/s, body: velocity at which clock offsets count, see correlated_fusion.py
     velocity_variance: wp.float64  # (m/s)^2 per axis, of v
@@ -107,6 +107,7 @@ class SourceMonitor:
     vector: vec3d  # a, of the present block
     sum: vec3d  # v, of the blocks of late
     information: mat33d  # V, likewise
+    map_variance: wp.float64  # m^2 per axis, of a landmark's place on the map, as declared
     rejected: wp.float64  # mean share of its bearings that fail the gate
     fitted_time: wp.float64  # s for which its bearings have passed it
     ratio: wp.float64  # twice the logarithm of the likelihood ratio of its fault to none
@@ -127,10 +128,12 @@ class JointBelief:
     """The joint state of a vehicle's estimator, without the members' poses and covariance."""
 
     odometry: Pose  # by dead reckoning, in a frame of its own
+    map_errors: wp.int32  # whether the map has any error
     has_sample: wp.int32  # whether there has been a tick
     sample_v: vec3d  # m/s, body: the odometry sample held at the last tick's end
     sample_w: vec3d  # rad/s, body
     mean_v: vec3d  # m/s, body: of the samples of late, see joint_state.py
+    mean_w: vec3d  # rad/s, body, likewise
     members: wp.int32  # how many
     first_sender: wp.int32  # the first of them that is another vehicle; before it the calibration states
     depends_on: wp.uint64  # bits of vehicles
@@ -186,11 +189,14 @@ class BearingFrame:
     tick: wp.int32
     bearings: wp.int32  # how many bearings can be used
     mounting: wp.int32  # the member that stands for the camera's mounting, 0 if there is none or it counts as noise
-    focal: wp.int32  # the member with the error of the focal length, likewise
+    errors: wp.int32  # the member with the errors of focal length and latency, likewise
     axis: vec3d  # optical, unit vector in the body
     lever: vec3d  # m, of the camera in the body
     variance: wp.float64  # rad^2, of a bearing per tangent axis
     period: wp.float64  # s, since the last frame
+    age: wp.float64  # s, since its exposure
+    since: Pose  # the vehicle's motion from now back to the exposure
+    jitter: wp.float64  # s^2, variance of the age that is new in every frame
 
 
 @wp.struct
@@ -202,6 +208,7 @@ class BearingMeasurement:
     bearing: vec3d  # body frame
     point: vec3d  # m, in the member's body or in the map
     variance: wp.float64  # m^2, of the point per axis
+    by_map: mat23d  # its derivative by the error of the point on the map, rad/m
     fits: wp.int32  # 1: used, -1: only by the monitors, 0: not
     noise: wp.float64  # rad^2 per axis
     common_noise: wp.float64  # rad^2, the largest for any hypothesis
@@ -305,11 +312,12 @@ def memory_struct(entries: str, of_reading: Any, name: str = "RobustMemory") -> 
         measurement: array("WL" + entries, BearingMeasurement)
         derivative: array(
             "WL" + entries + "J", Derivative
-        )  # of a bearing: by the errors of oneself, target, mounting, focal length
+        )  # of a bearing: by the errors of oneself, target, mounting, focal length and latency
         scratch: array("WLK", Scratch)
         projection: array("WL" + entries + "K", mat26d)  # H P, of a bearing and a member, see correction.py
         outbox_correlation: array("WNSC", Correlation)
         correlation: array("WNYC", Correlation)  # per receiver and box
+        map_projection: array("WL" + entries + "D", mat23d)  # covariance of a bearing with the errors of landmarks
         known: array("WLK", Regressor)
         reading: array("WL" + entries, of_reading)  # of measurements of sensors beside the camera, see readings.py
         reading_tick: array("WNR", wp.int32)  # of the last frame with measurements of a sensor; -1: none
@@ -322,8 +330,8 @@ def memory_struct(entries: str, of_reading: Any, name: str = "RobustMemory") -> 
 RobustMemory, RobustMemoryWithReadings = memory_struct("X", Nothing), memory_struct("F", FusedReading)
 
 
-ERRORS = 1  # the member that stands for the errors of odometry and of the focal length, see joint_state.py
-FOCAL_ERROR = 4  # that of the focal length among these errors
+ERRORS = 1  # the member that stands for the errors of odometry and frames, see joint_state.py
+FOCAL_ERROR, LATENCY_ERROR = 4, 5  # those of the focal length and of the latency among these errors
 MOUNTING = 2  # the member that stands for the error of the camera's mounting, where there is one, see joint_state.py
 DERIVATIVES = 4  # the most errors that a bearing depends on
 SENDER_SLOTS, LANDMARK_SLOTS = MAX_MEMBERS - 1, 4
@@ -334,6 +342,7 @@ ROBUST_SIZES = {
     "J": DERIVATIVES,
     "C": MAX_CORRELATIONS,
     "Q": SOURCES,
+    "D": LANDMARK_SLOTS,
     "T": SENDER_SLOTS,
     "U": 1 + SENDER_SLOTS,
     "O": 1 + MOUNTING,
@@ -408,7 +417,8 @@ def robust_rules() -> dict[str, Rule]:
     """Return the rules of a saved memory by field, see `coopenv.world.state`."""
     members = ROBUST_SIZES["K"]
     flags = (
-        "search.active search.found outbox.valid inbox.valid belief.has_sample member.has_twist source.excluded "
+        "search.active search.found outbox.valid inbox.valid belief.has_sample belief.map_errors member.has_twist "
+        "source.excluded "
         "member.correlation_unknown member.report.valid belief.gate_disabled outbox.carries_correlations "
         "inbox.carries_correlations member.report.carries_correlations"
     )

@@ -275,8 +275,10 @@ def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: PoseEs
 
 
 @subroutine
-def write(state: Any, memory: Any, world: int, i: int):
+def write(state: Any, memory: Any, world: int, i: int, decides: bool):
     """Write the own estimate to the state; during a search, the best hypothesis's.
+
+    Protection levels are renewed where an agent `decides` by them.
 
     The state holds positions in the body frame and covariances of (2 lambda, p), to first order.
     """
@@ -290,8 +292,9 @@ def write(state: Any, memory: Any, world: int, i: int):
     state.estimate_rotation[world, i] = type(state.estimate_rotation[world, i])(estimate.pose.R)
     state.estimate_position[world, i] = type(state.estimate_position[world, i])(position)
     state.covariance[world, i] = type(state.covariance[world, i])(P)
-    state.protection_level[world, i] = vec2d(wp.float64(wp.inf))
-    if memory.search[world, i].active == 0:
+    if memory.search[world, i].active == 1:
+        state.protection_level[world, i] = vec2d(wp.float64(wp.inf))
+    elif decides:
         state.protection_level[world, i] = protection_level(memory, world, i)
 
 
@@ -303,6 +306,9 @@ def start(model: Any, state: Any, memory: Any, world: int, i: int):
     """
     clear(memory, world, i)
     memory.belief[world, i].first_sender = 1
+    for landmark in range(model.landmarks):
+        if model.landmark_std[landmark] > type(model.landmark_std[landmark])(0.0):
+            memory.belief[world, i].map_errors = 1
     begin_errors(model, memory, world, i)
     R = orthonormalise(mat33d(state.estimate_rotation[world, i]))
     initial = PoseEstimate(
@@ -316,7 +322,7 @@ def start(model: Any, state: Any, memory: Any, world: int, i: int):
     else:
         memory.belief[world, i].depends_on = wp.uint64(0)  # an initial estimate depends on no sender
     clear_broadcasts(memory, world, i)
-    write(state, memory, world, i)
+    write(state, memory, world, i, True)
     receive_broadcast(model, state, memory, world, i)
 
 
@@ -396,7 +402,7 @@ def conclude(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
     """Write the estimate; begin a search if it is not valid."""
     if memory.search[world, i].active == 0 and not is_valid(own_estimate(memory, world, i)):
         declare_lost(model, memory, world, i, now.tick)  # by a message that no correct vehicle sends
-    write(state, memory, world, i)
+    write(state, memory, world, i, now.tick % model.ticks_per_decision == 0)
     if now.due:
         state.corrected_tick[world, i] = now.tick
 

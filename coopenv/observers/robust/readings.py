@@ -29,6 +29,7 @@ from coopenv.observers.robust.measurements import (
     linearised_frames,
     relative_spread,
     set_bearing_measurement,
+    set_mapped_point,
     set_measurement_of_member,
 )
 from coopenv.observers.robust.memory import (
@@ -44,8 +45,7 @@ from coopenv.observers.robust.memory import (
     vec6d,
 )
 from coopenv.observers.robust.messages import is_circular
-from coopenv.observers.robust.sources import is_excluded, take_slot
-from coopenv.world.camera import mapped_position
+from coopenv.observers.robust.sources import is_excluded
 from coopenv.world.model import STATIC
 from coopenv.world.nearby import box_of_entry
 from coopenv.world.warp_internals import device_function, overload_of
@@ -109,10 +109,7 @@ def set_target(model: Any, state: Any, memory: Any, world: int, i: int, frame: B
     n = frame.bearings
     sender = target - model.landmarks
     if sender < 0:
-        point = vec3d(mapped_position(model, state, world, i, target))
-        set_bearing_measurement(memory, world, i, n, 0, vec3d(), point, wp.float64(0.0))
-        q = take_slot(memory, world, i, target, frame.tick, True, model.camera_period)
-        memory.measurement[world, i, n].source = q
+        set_mapped_point(model, state, memory, world, i, frame, target)
         memory.reading[world, i, n].turn = mat33d(state.rotation[world, target])
         memory.reading[world, i, n].turn_known = wp.where(model.motion.kind[target] == STATIC, 1, 0)
         return True
@@ -219,14 +216,16 @@ def unused_rows_with_sensors(memory: Any, world: int, i: int, count: Any) -> int
 
 
 @device_function
-def bend_variances(member: int, period: Any, along: Any, across: Any):
+def bend_variances(memory: Any, world: int, i: int, n: int, along: Any, across: Any):
     """Return the variances of second-order errors, m^4, of rows across the line of sight and along it.
 
     They are to be multiplied by the squared derivatives by the target's position and divided by the squared distance.
     Ranges alone correct an error across them slowly, that of a landmark as well.
     """
+    period = memory.reading[world, i, n].period
     lasting = frames_in(wp.float64(constants.CONSIDERED_LINEARISATION_TIME), period)
-    return vec2d(linearised_frames(member, period) * along, wp.float64(0.5) * lasting * across) * across
+    frames = linearised_frames(memory, world, i, n, period)
+    return vec2d(frames * along, wp.float64(0.5) * lasting * across) * across
 
 
 @device_function
@@ -277,8 +276,8 @@ def linearise_reading_with_sensors(memory: Any, world: int, i: int, n: Any) -> b
     bend = vec2d()
     if kind != RELATIVE_POSE:  # which is linear in the positions
         to_own = wp.transpose(own.R)
-        along, across = relative_spread(memory, world, i, member, to_own * theirs_R, to_own * u)
-        bend = bend_variances(member, memory.reading[world, i, n].period, along, across) / (distance * distance)
+        along, across = relative_spread(memory, world, i, n, to_own * theirs_R, to_own * u)
+        bend = bend_variances(memory, world, i, n, along, across) / (distance * distance)
     arm = own.R * skew(place)
     reach = theirs_R * skew(point)
     H = mat26d()
@@ -308,6 +307,7 @@ def linearise_reading_with_sensors(memory: Any, world: int, i: int, n: Any) -> b
             used += 1
     memory.reading[world, i, n].used = used
     memory.derivative[world, i, n, 0] = Derivative(0, H)
+    memory.measurement[world, i, n].by_map = -(H[:, 3:] * wp.transpose(own.R))
     memory.derivative[world, i, n, 1] = Derivative(wp.where(member > 0, member, -1), G)
     memory.derivative[world, i, n, 2] = Derivative(-1, mat26d())
     memory.derivative[world, i, n, 3] = Derivative(-1, mat26d())
