@@ -231,12 +231,12 @@ def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: in
     """Weigh the hypotheses after a block of a time, s; exclude the source of one nearly certain, own sensors first.
 
     Soon after it began, a fault of the gyro looks like one of the camera: if both are likelier than none, both
-    count as faulty. While the gate is disabled, the innovations of a wrong pose reveal faults of own sensors only.
+    count as faulty. While most bearings fail the gate, innovations of a wrong pose reveal faults of own sensors only.
     """
     end_block(memory, world, i, time)
     discount_rivals(memory, world, i)
     memory.fault_mixture[world, i] = mat66d()
-    lost = memory.belief[world, i].gate_disabled == 1
+    lost = memory.belief[world, i].lost_time > wp.float64(0.0)
     gate = wp.float64(constants.FAULT_GATE)
     most = gate
     worst = int(-1)

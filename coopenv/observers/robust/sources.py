@@ -92,13 +92,21 @@ def release_slot(memory: Any, world: int, i: int, q: int):
 
 
 @device_function
-def begin_sources(memory: Any, world: int, i: int):
-    """Begin without any information about sources; all are used."""
+def begin_monitors(memory: Any, world: int, i: int):
+    """Begin without any information about the sources."""
     memory.fault_mixture[world, i] = mat66d()
     for q in range(SOURCES):
-        release_slot(memory, world, i, q)
+        clear_source(memory, world, i, q)
     for k in range(3):
         memory.sensitivity[world, i, PRIOR, 0][k + 3, k] += wp.float64(1.0)
+
+
+@device_function
+def begin_sources(memory: Any, world: int, i: int):
+    """Begin without sources, so that none is excluded."""
+    for q in range(SOURCES):
+        release_slot(memory, world, i, q)
+    begin_monitors(memory, world, i)
 
 
 @device_function
