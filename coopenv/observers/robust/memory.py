@@ -89,6 +89,7 @@ class SourceMonitor:
     information: mat33d  # V, likewise
     rejected: wp.float64  # mean share of its bearings that fail the gate
     fitted_time: wp.float64  # s for which its bearings have passed it
+    rejected_time: wp.float64  # s for which most have failed it without a pause
     ratio: wp.float64  # twice the logarithm of the likelihood ratio of its fault to none
     offset: vec3d  # f: its most likely fault, of an excluded one when it was excluded
     covariance: mat33d  # of that fault
