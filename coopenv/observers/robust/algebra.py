@@ -24,6 +24,7 @@ from coopenv.world.warp_internals import device_function
 
 KNOWN_ANGLE_VARIANCE = constants.KNOWN_ANGLE**2
 KNOWN_POSITION_VARIANCE = constants.KNOWN_POSITION**2
+VAGUE_ANGLE_VARIANCE = constants.VAGUE_ANGLE**2
 QUARTER = 0.25 / constants.MAX_ACCELERATION**2
 BEYOND = -0.9  # cosine of an angle below which the skew part of a rotation does not determine its axis
 
@@ -233,6 +234,12 @@ def is_known(P: Any):
         if not (P[i, i] < wp.float64(KNOWN_ANGLE_VARIANCE) and P[i + 3, i + 3] < wp.float64(KNOWN_POSITION_VARIANCE)):
             return False
     return True
+
+
+@wp.func
+def is_vague(P: Any):
+    """Return whether the covariance P of a pose leaves its orientation open."""
+    return wp.max(wp.max(P[0, 0], P[1, 1]), P[2, 2]) > wp.float64(VAGUE_ANGLE_VARIANCE)
 
 
 @wp.func

@@ -17,7 +17,7 @@ SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
 SHORT_TIME, MEAN_TIME, LONG_TIME = 0.5, 1.0, 2.0
 """Times, s. Short: block of the monitors; silence after which a sender may restart; least tracking of a hypothesis.
 Mean: window of recent means; duration of errors of calibration and of messages; time out of view after which sources
-are evicted first. Long: least exclusion of a source; time for which most bearings may fail the gate before a search,
+are evicted first. Long: least exclusion of a source; time for which most bearings may fail the gate before a restart,
 and for which a search requires well determined solutions. Chosen."""
 
 # Belief
@@ -59,8 +59,8 @@ equally likely. Chosen."""
 MONITOR_TIME = 10.0  # s: time constant of the sums of a monitor. Chosen
 OWN_FAULT = 0.1  # deviation of a fault of velocity and focal length, as a share, gyro, rad/s, and camera, rad. Chosen
 LOST_SHARE, FOUND_SHARE = 0.6, 0.2
-"""Share of bearings that fail the gate from which on all bearings count, and share below which the gate counts again
-and the pose is an anchor. Chosen: one wrong association of two does not exceed the first."""
+"""Share of bearings that fail the gate from which on a vehicle counts as lost, and share below which it is not and its
+pose is an anchor. Chosen: one wrong association of two does not exceed the first."""
 
 # Messages
 
@@ -86,6 +86,7 @@ MASK_BITS = 64  # vehicles in a mask; numbers from 64 on share bits with lower o
 
 KNOWN_ANGLE, KNOWN_POSITION = 0.2, 2.0
 """Standard deviation per axis (rad and m) below which a pose is a linearisation point and is broadcast. Chosen."""
+VAGUE_ANGLE = 1.0  # standard deviation per axis, rad, above which an orientation is unknown. Chosen
 MAX_HYPOTHESES = 6  # most hypotheses at once: P3P has four solutions at most, the prior is one more. Chosen
 MARGIN = 2.0
 """Standard deviations by which measurements are perturbed to find solutions that noise removes; factor of a neighbour's

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import by_rows, displaced, recentring, transposed_by_rows
+from coopenv.observers.robust.algebra import by_rows, displaced, is_known, recentring, transposed_by_rows
 from coopenv.observers.robust.joint_state import apply_corrections, set_block
 from coopenv.observers.robust.linearisation import innovation_cross_covariance, innovation_weight, linearise, project
 from coopenv.observers.robust.memory import DERIVATIVES, ERRORS, BearingFrame, mat66d, vec6d
@@ -180,9 +180,9 @@ def iterated_update(frame: BearingFrame, memory: Any, world: int, i: int):
     for k in range(memory.belief[world, i].members):
         memory.scratch[world, i, k].last_correction = vec6d()
         memory.scratch[world, i, k].pose = memory.member[world, i, k].pose
-    if memory.belief[world, i].gate_disabled == 0:
+    if is_known(memory.P[world, i, 0, 0]):
         gate_jointly(memory, world, i, bearings)
-    else:
+    else:  # innovations after the first one are not linear enough to reject any
         correct_by_bearings(memory, world, i, bearings, False)
     share = next_share(memory, world, i, bearings, True)
     step = int(1)

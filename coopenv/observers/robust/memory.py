@@ -109,6 +109,7 @@ class SourceMonitor:
     information: mat33d  # V, likewise
     rejected: wp.float64  # mean share of its bearings that fail the gate
     fitted_time: wp.float64  # s for which its bearings have passed it
+    rejected_time: wp.float64  # s for which most have failed it without a pause
     ratio: wp.float64  # twice the logarithm of the likelihood ratio of its fault to none
     offset: vec3d  # f: its most likely fault, of an excluded one when it was excluded
     covariance: mat33d  # of that fault
@@ -137,8 +138,8 @@ class JointBelief:
     rejected_share: wp.float64  # mean share of bearings that fail the gate
     rejected_sources: wp.uint64  # bits of the slots of which any has failed since that share was last low
     healthy_time: wp.float64  # s for which it has been low
-    gate_disabled: wp.int32  # whether all bearings count, because most have failed the gate
-    gate_disabled_time: wp.float64  # s for which they have counted
+    lost_time: wp.float64  # s for which most bearings have failed the gate
+    counted_tick: wp.int32  # of the last frame with bearings that count
     block_time: wp.float64  # s since the monitors' present block began
     news_interval: wp.int32  # of `NEWS_TIME`, the last with a report that carries correlations, from 1 on
     guard: GuardTotals
@@ -159,7 +160,7 @@ class Search:
 
     active: wp.int32
     found: wp.int32  # whether at this tick
-    prior: PoseEstimate  # carried on by odometry
+    prior: PoseEstimate  # the tracked estimate, while the belief's arrays serve one hypothesis after the other
     hypotheses: wp.int32  # how many
     tracked_time: wp.float64  # s for which hypotheses have been tracked
     least_time: wp.float64  # s for which they have to be tracked before one is accepted
@@ -409,10 +410,13 @@ def robust_rules() -> dict[str, Rule]:
     members = ROBUST_SIZES["K"]
     flags = (
         "search.active search.found outbox.valid inbox.valid belief.has_sample member.has_twist source.excluded "
-        "member.correlation_unknown member.report.valid belief.gate_disabled outbox.carries_correlations "
+        "member.correlation_unknown member.report.valid outbox.carries_correlations "
         "inbox.carries_correlations member.report.carries_correlations"
     )
-    ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick source.seen_tick reading_tick"
+    ticks = (
+        "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick source.seen_tick belief.counted_tick "
+        "reading_tick"
+    )
     large = (
         "hypothesis.cost hypothesis.misfit hypothesis.prior_distance fault_mixture sensitivity information "
         "drift_effect source.drift source.drift_vector source.drift_information source.drift_ratio source.drift_time "
@@ -438,7 +442,6 @@ def robust_rules() -> dict[str, Rule]:
             "belief.members", {"member.pose.R": ROTATION, "member.vehicle": whole(0, "vehicles"), "member.box": BOX}
         ),
         **where("belief.members", {"member.source": _of_senders(whole(1, SENDER_SLOTS))}),
-        **where("search.active", {"search.prior.pose.R": ROTATION, "search.prior.P": COVARIANCE}),
         **where("search.hypotheses", {"hypothesis.estimate.pose.R": ROTATION, "hypothesis.estimate.P": COVARIANCE}),
     }
     reports = {"pose.R": ROTATION, "P": COVARIANCE, "odometry.R": ROTATION}

@@ -3,8 +3,8 @@
 A vehicle estimates a joint state of itself and of the vehicles that it receives. Bearings to landmarks and to vehicles
 correct it. A neighbour's message adds the information that is new since its last message. So no information counts
 twice, and the neighbour's slowly varying error does not count as white noise. If most bearings fail the gate, to more
-than one target, all of them count for a while. If that does not help, or without a useful prior, the pose is searched
-for; during a search the vehicle broadcasts nothing.
+than one target, the estimate restarts with a larger covariance, and hypotheses of a search compete with it. So they do
+with an uncertain initial estimate. During a search the vehicle broadcasts nothing.
 
 After a search, the own pose is resected from one frame alone, and the other members stay. The own covariance becomes
 that of the solution, members' errors included: G (N + H_o P_o H_o^T) G^T with G = (H^T W H)^-1 H^T W. The
@@ -34,6 +34,7 @@ from coopenv.observers.robust.algebra import (
     inverse_factor,
     is_known,
     is_regular,
+    is_vague,
     odometry_noise,
     with_noise,
 )
@@ -66,6 +67,7 @@ from coopenv.observers.robust.memory import (
     PoseEstimate,
     RobustMemory,
     RobustMemoryWithReadings,
+    Search,
     clear,
     mat33d,
     mat66d,
@@ -76,9 +78,9 @@ from coopenv.observers.robust.memory import (
     vec6d,
 )
 from coopenv.observers.robust.messages import ROBUST_MESSAGES, bit_of
-from coopenv.observers.robust.readings import add_readings, rows_in, rows_of_kind, unused_rows
+from coopenv.observers.robust.readings import add_readings, is_reading, rows_in, rows_of_kind, unused_rows
 from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
-from coopenv.observers.robust.sources import begin_sources, is_excluded
+from coopenv.observers.robust.sources import begin_monitors, begin_sources, is_excluded
 from coopenv.world.embedded import Embedded
 from coopenv.world.nearby import is_target
 from coopenv.world.v2x import start_covariance
@@ -87,43 +89,47 @@ from coopenv.world.warp_internals import device_function, subroutine
 ANCHOR_ANGLE_VARIANCE = (0.25 * constants.KNOWN_ANGLE) ** 2
 ANCHOR_POSITION_VARIANCE = (0.25 * constants.KNOWN_POSITION) ** 2
 """Variances (rad^2 and m^2) added to the covariance of an anchor, which may be wrong at the time of the loss."""
+INFLATION = constants.SQUARED_MARGIN**2  # of an anchor's covariance for the next restart
 
 
 @subroutine
 def gate(frame: BearingFrame, memory: Any, world: int, i: int):
     """Linearise the bearings and gate them; return the share of rejected ones, the number of used ones, and their NIS.
 
-    Bearings to excluded sources are not used and do not count in the share, which is -1 if none counts.
+    Bearings to excluded sources are not used and do not count in the share, nor do measurements without a target. The
+    share is the larger one of the camera's bearings and of the other sensors' measurements, -1 if none counts: ranges
+    may fit at a wrong heading.
     """
-    counted = int(0)
-    missed = int(0)
+    counted = vec2d()
+    missed = vec2d()
     fitting = int(0)
     total = wp.float64(0.0)
-    all_count = frame.purpose == TRACKING and memory.belief[world, i].gate_disabled == 1
     for n in range(frame.bearings):
         nis = innovation_squared(frame, memory, world, i, n)
         ahead = nis >= wp.float64(0.0) and nis < wp.float64(wp.inf)
         fits = ahead and nis < wp.float64(constants.BEARING_GATE)
         q = memory.measurement[world, i, n].source
         used = not is_excluded(memory, world, i, q)
-        if used:
-            counted += 1
+        if used and memory.measurement[world, i, n].distance < wp.float64(wp.inf):
+            kind = wp.where(is_reading(memory, world, i, n), 1, 0)
+            counted[kind] = counted[kind] + wp.float64(1.0)
             if not fits:
-                missed += 1
+                missed[kind] = missed[kind] + wp.float64(1.0)
                 rejected = memory.belief[world, i].rejected_sources | bit_of(1 + q)
                 memory.belief[world, i].rejected_sources = rejected
-        elif ahead:
+        elif ahead and not used:
             test_excluded(frame, memory, world, i, n, q)
         memory.measurement[world, i, n].fits = 0
-        if used and (fits or (all_count and ahead)):
+        if used and fits:
             memory.measurement[world, i, n].fits = 1
             fitting += 1
             total += nis
         elif used and ahead and frame.purpose == TRACKING:  # for the monitors
             memory.measurement[world, i, n].fits = -1
     share = wp.float64(-1.0)
-    if counted > 0:
-        share = wp.float64(missed) / wp.float64(counted)
+    for kind in range(2):
+        if counted[kind] > wp.float64(0.0):
+            share = wp.max(share, missed[kind] / counted[kind])
     return share, fitting, total
 
 
@@ -136,40 +142,61 @@ def is_valid(estimate: PoseEstimate):
 
 @subroutine
 def declare_lost(model: Any, memory: Any, world: int, i: int, tick: int):
-    """Begin a search whose prior is the anchor, propagated by odometry."""
+    """Restart from the anchor, propagated by odometry, with a larger covariance after each failure; begin a search."""
     anchor = memory.anchor[world, i]
     elapsed = wp.float64(tick - anchor.tick) * model.camera_period
     step = between(anchor.odometry, memory.belief[world, i].odometry)
     begin_errors(model, memory, world, i)  # their estimates may be wrong, too
     noise = increment_noise(model, memory, world, i, step, elapsed, elapsed)
-    begin_search(memory, world, i, carried(anchor.estimate, step, noise))
+    restart_belief(model, memory, world, i, carried(anchor.estimate, step, noise))
+    P = wp.float64(INFLATION) * anchor.estimate.P
+    if not is_vague(P):
+        memory.anchor[world, i].estimate.P = P
+    if memory.search[world, i].active == 0:
+        begin_search(memory, world, i)
+
+
+@device_function
+def confirm(memory: Any, world: int, i: int):
+    """End a search by the tracked estimate; its monitors begin."""
+    memory.search[world, i] = Search()
+    begin_monitors(memory, world, i)
 
 
 @device_function
 def note_rejections(model: Any, memory: Any, world: int, i: int, share: Any, now: Any):
-    """Let all bearings count from when most fail the gate until few do; begin a search if that does not help.
+    """Declare the vehicle lost if most bearings have failed the gate for long; end a search if few do.
 
-    Most bearings fail if the own pose is wrong. If only one source's bearings fail, that source is as likely wrong.
+    A frame counts for the time since the last one with bearings, within `NEWS_TIME`. Most bearings fail if the own pose
+    is wrong. If only one source's bearings fail, that source is as likely wrong.
     """
-    weight = wp.min(wp.float64(1.0), now.period / wp.float64(constants.MEAN_TIME))
+    since = wp.float64(now.tick - memory.belief[world, i].counted_tick) * model.camera_period
+    memory.belief[world, i].counted_tick = now.tick
+    period = wp.clamp(since, now.period, wp.max(now.period, wp.float64(constants.NEWS_TIME)))
+    weight = wp.min(wp.float64(1.0), period / wp.float64(constants.MEAN_TIME))
     missed = memory.belief[world, i].rejected_share + (share - memory.belief[world, i].rejected_share) * weight
     memory.belief[world, i].rejected_share = missed
     several = wp.bit_count(memory.belief[world, i].rejected_sources) > wp.uint64(1)
-    if missed > wp.float64(constants.LOST_SHARE) and several:
-        memory.belief[world, i].gate_disabled = 1
-    elif missed < wp.float64(constants.FOUND_SHARE):
-        memory.belief[world, i].gate_disabled = 0
-        memory.belief[world, i].rejected_sources = wp.uint64(0)
-        memory.belief[world, i].gate_disabled_time = wp.float64(0.0)
-    memory.belief[world, i].gate_disabled_time += wp.float64(memory.belief[world, i].gate_disabled) * now.period
-    healthy = memory.belief[world, i].healthy_time + now.period
+    many = missed > wp.float64(constants.LOST_SHARE)
+    if memory.belief[world, i].lost_time > wp.float64(0.0) or (many and several):
+        memory.belief[world, i].lost_time += period
+    healthy = memory.belief[world, i].healthy_time + period
     if missed >= wp.float64(constants.FOUND_SHARE):
         healthy = wp.float64(0.0)
+    else:
+        memory.belief[world, i].rejected_sources = wp.uint64(0)
+        memory.belief[world, i].lost_time = wp.float64(0.0)
     memory.belief[world, i].healthy_time = healthy
-    long = memory.belief[world, i].gate_disabled_time > wp.float64(constants.LONG_TIME)
-    if long and missed > wp.float64(constants.LOST_SHARE):
+    longest = wp.where(memory.search[world, i].active == 1, constants.MEAN_TIME, constants.LONG_TIME)
+    if memory.belief[world, i].lost_time > wp.float64(longest) and many:
         declare_lost(model, memory, world, i, now.tick)
-    elif healthy > wp.float64(constants.MEAN_TIME) and is_valid(own_estimate(memory, world, i)):
+        return
+    if healthy <= wp.float64(constants.MEAN_TIME) or not is_valid(own_estimate(memory, world, i)):
+        return
+    searching = memory.search[world, i].active == 1
+    if searching and memory.search[world, i].hypotheses == 0 and is_known(memory.P[world, i, 0, 0]):
+        confirm(memory, world, i)
+    if memory.search[world, i].active == 0:
         noise = vec2d(wp.float64(ANCHOR_ANGLE_VARIANCE), wp.float64(ANCHOR_POSITION_VARIANCE))
         P = with_noise(wp.float64(constants.SQUARED_MARGIN) * memory.P[world, i, 0, 0], noise)
         set_anchor(memory, world, i, P, now.tick)
@@ -177,19 +204,22 @@ def note_rejections(model: Any, memory: Any, world: int, i: int, share: Any, now
 
 @device_function
 def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, frame: BearingFrame):
-    """Correct the belief by the bearings of a frame that pass the gate, and test all sources."""
+    """Correct the belief by the bearings of a frame that pass the gate, and test all sources, but not in a search."""
     share, fitting, nis = gate(frame, memory, world, i)
     state.nis[world, i] = nis
     state.nis_dof[world, i] = 2 * fitting - unused_rows(memory, world, i, frame.bearings)
-    if share >= wp.float64(0.0):  # rejected bearings show faults
-        guard_covariance(frame, memory, world, i)
+    if fitting > 0 or share >= wp.float64(0.0):  # rejected bearings show faults
+        if memory.search[world, i].active == 0:
+            guard_covariance(frame, memory, world, i)
         iterated_update(frame, memory, world, i)
-        correct_sources(frame, memory, world, i)
+        if memory.search[world, i].active == 0:
+            correct_sources(frame, memory, world, i)
     memory.belief[world, i].block_time += frame.period
     block = memory.belief[world, i].block_time
     if block > wp.float64(constants.SHORT_TIME - constants.SAME_TIME):
         memory.belief[world, i].block_time = wp.float64(0.0)
-        detect_and_exclude(memory, world, i, block, model.landmarks)
+        if memory.search[world, i].active == 0:
+            detect_and_exclude(memory, world, i, block, model.landmarks)
     if share >= wp.float64(0.0):
         note_rejections(model, memory, world, i, share, now)
 
@@ -259,8 +289,8 @@ def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: PoseEs
     begin_sources(memory, world, i)
     memory.belief[world, i].rejected_share = wp.float64(0.0)
     memory.belief[world, i].rejected_sources = wp.uint64(0)
-    memory.belief[world, i].gate_disabled = 0
-    memory.belief[world, i].gate_disabled_time = wp.float64(0.0)
+    memory.belief[world, i].lost_time = wp.float64(0.0)
+    memory.belief[world, i].healthy_time = wp.float64(0.0)
     bits = wp.uint64(0)
     agents = model.agents
     if model.listed == 1:
@@ -281,10 +311,8 @@ def write(state: Any, memory: Any, world: int, i: int):
     The state holds positions in the body frame and covariances of (2 lambda, p), to first order.
     """
     estimate = estimate_with_faults(memory, world, i)
-    if memory.search[world, i].active == 1:
-        estimate = memory.search[world, i].prior
-        if memory.search[world, i].hypotheses > 0:
-            estimate = memory.hypothesis[world, i, 0].estimate
+    if memory.search[world, i].hypotheses > 0:
+        estimate = memory.hypothesis[world, i, 0].estimate
     position = wp.transpose(estimate.pose.R) * estimate.pose.p
     P = symmetric_part(sheared(estimate.P, skew(position)))
     state.estimate_rotation[world, i] = type(state.estimate_rotation[world, i])(estimate.pose.R)
@@ -299,7 +327,7 @@ def write(state: Any, memory: Any, world: int, i: int):
 def start(model: Any, state: Any, memory: Any, world: int, i: int):
     """Start at the initial estimate, and receive the leaders' messages.
 
-    An estimate that is too uncertain to linearise about is only a prior for the search.
+    While it is too uncertain to linearise about, hypotheses of a search compete with it.
     """
     clear(memory, world, i)
     memory.belief[world, i].first_sender = 1
@@ -312,7 +340,7 @@ def start(model: Any, state: Any, memory: Any, world: int, i: int):
     memory.belief[world, i].odometry.R = wp.identity(3, wp.float64)
     set_anchor(memory, world, i, initial.P, 0)
     if not is_known(initial.P):
-        begin_search(memory, world, i, initial)
+        begin_search(memory, world, i)
     else:
         memory.belief[world, i].depends_on = wp.uint64(0)  # an initial estimate depends on no sender
     clear_broadcasts(memory, world, i)
@@ -321,9 +349,10 @@ def start(model: Any, state: Any, memory: Any, world: int, i: int):
 
 
 @device_function
-def is_searching(memory: Any, world: int, i: int) -> bool:
-    """Return whether the own pose is searched for, and has not been found at this tick."""
-    return memory.search[world, i].active == 1 and memory.search[world, i].found == 0
+def is_tracking(memory: Any, world: int, i: int) -> bool:
+    """Return whether messages and bearings correct the belief; not in a search that began with no orientation."""
+    searching = memory.search[world, i].active == 1 and memory.search[world, i].found == 0
+    return not (searching and is_vague(memory.anchor[world, i].estimate.P))
 
 
 # A tick in parts; with `Embedded.parts` each is a kernel of its own on a GPU.
@@ -340,21 +369,20 @@ def propagate_belief(model: Any, state: Any, memory: Any, world: int, i: int, no
     if memory.search[world, i].active == 1:
         noise = increment_noise(model, memory, world, i, step, now.period, wp.float64(constants.MEAN_TIME)) + jump
         propagate_search(memory, world, i, step, noise)
-    else:
-        noise = odometry_noise(model, i, now.period) + jump
-        propagate_own(memory, world, i, step, noise, now.period)
+    noise = odometry_noise(model, i, now.period) + jump
+    propagate_own(memory, world, i, step, noise, now.period)
 
 
 @subroutine
 def accept_hypothesis(model: Any, memory: Any, world: int, i: int):
-    """Make the single hypothesis that is left the estimate, or the prior, which ends the search, if both agree."""
+    """Make the single hypothesis that is left the estimate; if the tracked one agrees with it, end the search."""
     found = memory.hypothesis[world, i, 0].estimate
-    prior = memory.search[world, i].prior
-    if is_known(prior.P) and distance_squared(prior, found) < wp.float64(constants.POSE_GATE):
-        found = prior
-        memory.search[world, i].active = 0
-    restart_belief(model, memory, world, i, found)
-    memory.search[world, i].found = 1
+    tracked = own_estimate(memory, world, i)
+    if is_known(tracked.P) and distance_squared(tracked, found) < wp.float64(constants.POSE_GATE):
+        confirm(memory, world, i)
+    else:
+        restart_belief(model, memory, world, i, found)
+        memory.search[world, i].found = 1
 
 
 @device_function
@@ -369,15 +397,15 @@ def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
 @device_function
 def fuse(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
     """Fuse the reports that are new."""
-    if not is_searching(memory, world, i):
+    if is_tracking(memory, world, i):
         fuse_messages(model, state, memory, world, i, now.tick)
 
 
 @device_function
 def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
     """Correct the belief by a frame; a pose that the search has just found is resected from this frame alone."""
-    if now.due and not is_searching(memory, world, i):
-        found = memory.search[world, i].active == 1
+    if now.due and is_tracking(memory, world, i):
+        found = memory.search[world, i].found == 1
         frame = set_bearing_measurements(model, state, memory, world, i, now, wp.where(found, RESECTION, TRACKING))
         if not found:
             frame.bearings = add_readings(memory, model, state, world, i, frame)
@@ -385,7 +413,7 @@ def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
         else:
             determined = resect(frame, memory, world, i)
             if determined and is_known(wp.float64(constants.SQUARED_MARGIN) * memory.P[world, i, 0, 0]):
-                memory.search[world, i].active = 0
+                memory.search[world, i] = Search()
             else:  # track the remaining hypothesis for some more frames
                 least = memory.search[world, i].tracked_time + wp.float64(constants.NEWS_TIME)
                 memory.search[world, i].least_time = least
@@ -394,7 +422,7 @@ def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
 @device_function
 def conclude(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
     """Write the estimate; begin a search if it is not valid."""
-    if memory.search[world, i].active == 0 and not is_valid(own_estimate(memory, world, i)):
+    if not is_valid(own_estimate(memory, world, i)):
         declare_lost(model, memory, world, i, now.tick)  # by a message that no correct vehicle sends
     write(state, memory, world, i)
     if now.due:

@@ -1,9 +1,9 @@
-"""Search for the pose without a prior: solutions of the P3P problem are tracked until motion separates them.
+"""Search for the pose beside the tracked estimate: solutions of the P3P problem compete until motion separates them.
 
 Each hypothesis has a filter of its own. Its cost is the sum of its normalised innovations squared, each bounded. The
 difference of two costs is twice the logarithm of the likelihood ratio, if both have the same noise; otherwise a vague
 hypothesis with a large linearisation error would have the least cost. Hypotheses with a cost far above the least one
-are pruned. During a search there is no belief: its arrays serve to correct one hypothesis after the other.
+are pruned. The belief's arrays serve to correct one hypothesis after the other.
 
 Noise can remove two close solutions of P3P. Every bearing, and every position that is not exactly known, is therefore
 also perturbed by some standard deviations to each side.
@@ -18,10 +18,20 @@ from coopenv.observers.p3p import camera_pose, solve_triangle
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import carried, distance_squared, inverse6, is_known, is_regular
 from coopenv.observers.robust.correction import iterated_update
-from coopenv.observers.robust.joint_state import begin_belief, own_estimate
+from coopenv.observers.robust.joint_state import begin_belief, own_estimate, set_block
 from coopenv.observers.robust.linearisation import innovation_squared, innovation_with, linearise, tangent_basis
 from coopenv.observers.robust.measurements import SEARCH, frames_in, set_bearing_measurements
-from coopenv.observers.robust.memory import BearingFrame, Hypothesis, Pose, PoseEstimate, Search, mat33d, mat66d
+from coopenv.observers.robust.memory import (
+    ERRORS,
+    MOUNTING,
+    BearingFrame,
+    Hypothesis,
+    Pose,
+    PoseEstimate,
+    Search,
+    mat33d,
+    mat66d,
+)
 from coopenv.world.warp_internals import device_function, subroutine
 
 PROBLEMS = 1 + 3 * 2 * 5
@@ -87,6 +97,7 @@ def add_hypothesis(memory: Any, world: int, i: int):
     """Add the present estimate as a hypothesis, unless there is one like it."""
     h = memory.search[world, i].hypotheses
     if h < constants.MAX_HYPOTHESES:
+        memory.hypothesis[world, i, h] = Hypothesis()
         memory.hypothesis[world, i, h].estimate = own_estimate(memory, world, i)
         if is_new(memory, world, i, h, h):
             memory.search[world, i].hypotheses = h + 1
@@ -147,18 +158,16 @@ def solve_triple(
 
 
 @device_function
-def begin_search(memory: Any, world: int, i: int, prior: PoseEstimate):
-    """Start from a prior, without hypotheses."""
+def begin_search(memory: Any, world: int, i: int):
+    """Begin a search without hypotheses."""
     memory.search[world, i] = Search()
     memory.search[world, i].active = 1
-    memory.search[world, i].prior = prior
     memory.search[world, i].least_time = wp.float64(constants.SHORT_TIME)
 
 
 @device_function
 def propagate_search(memory: Any, world: int, i: int, step: Pose, noise: Any):
-    """Carry the prior and all hypotheses through a tick's odometry."""
-    memory.search[world, i].prior = carried(memory.search[world, i].prior, step, noise)
+    """Carry all hypotheses through a tick's odometry."""
     for h in range(memory.search[world, i].hypotheses):
         memory.hypothesis[world, i, h].estimate = carried(memory.hypothesis[world, i, h].estimate, step, noise)
 
@@ -246,12 +255,15 @@ def track_hypothesis(frame: BearingFrame, memory: Any, world: int, i: int, h: in
 
 @device_function
 def add_prior(memory: Any, world: int, i: int):
-    """Add the prior as a hypothesis if its covariance is small enough."""
-    prior = memory.search[world, i].prior
-    if is_known(prior.P):
-        h = memory.search[world, i].hypotheses
+    """Add the tracked estimate as a hypothesis if it is known; the others have the distance to it as a cost."""
+    h = memory.search[world, i].hypotheses
+    for g in range(h):
+        distance = distance_squared(memory.search[world, i].prior, memory.hypothesis[world, i, g].estimate)
+        memory.hypothesis[world, i, g].cost = wp.min(distance, wp.float64(constants.MAX_PRIOR_COST))
+        memory.hypothesis[world, i, g].prior_distance = distance
+    if is_known(memory.search[world, i].prior.P):
         memory.hypothesis[world, i, h] = Hypothesis()
-        memory.hypothesis[world, i, h].estimate = prior
+        memory.hypothesis[world, i, h].estimate = memory.search[world, i].prior
         memory.search[world, i].hypotheses = h + 1
 
 
@@ -282,11 +294,6 @@ def solve_chosen(
         determined = wp.float64(-constants.NEWS_TIME)
         tracking = False
     if tracking:
-        for h in range(memory.search[world, i].hypotheses):
-            distance = distance_squared(memory.search[world, i].prior, memory.hypothesis[world, i, h].estimate)
-            memory.hypothesis[world, i, h].cost = wp.min(distance, wp.float64(constants.MAX_PRIOR_COST))
-            memory.hypothesis[world, i, h].prior_distance = distance
-            memory.hypothesis[world, i, h].misfit = wp.float64(0.0)
         determined = wp.float64(0.0)
         least = wp.where(require_determined, wp.float64(constants.SHORT_TIME), wp.float64(constants.LONG_TIME))
         memory.search[world, i].least_time = least
@@ -298,22 +305,21 @@ def solve_chosen(
 
 @subroutine
 def begin_hypotheses(frame: BearingFrame, memory: Any, world: int, i: int, period: Any):
-    """Begin with a known prior in the first attempt, then with solutions, too; each attempt uses other bearings.
+    """Begin with the solutions of three bearings, others in each attempt, and the tracked estimate if it is known.
 
     Return the used bearings, and for how many hypotheses.
     """
     triple = wp.vec3i(-1, -1, -1)
     solved = int(0)
-    tracking = memory.search[world, i].attempts == 0 and is_known(memory.search[world, i].prior.P)
-    if not tracking:
-        memory.search[world, i].waited_time += period
-        memory.search[world, i].determined_time += period
-        require_determined = memory.search[world, i].waited_time < wp.float64(constants.LONG_TIME)
-        # not soon after a frame that did not determine the pose
-        if not require_determined or memory.search[world, i].determined_time > wp.float64(-constants.SAME_TIME):
-            triple = chosen_triple(frame, memory, world, i)
-            tracking = solve_chosen(frame, memory, world, i, triple, period, require_determined)
-            solved = memory.search[world, i].hypotheses
+    memory.search[world, i].waited_time += period
+    memory.search[world, i].determined_time += period
+    require_determined = memory.search[world, i].waited_time < wp.float64(constants.LONG_TIME)
+    tracking = bool(False)
+    # not soon after a frame that did not determine the pose
+    if not require_determined or memory.search[world, i].determined_time > wp.float64(-constants.SAME_TIME):
+        triple = chosen_triple(frame, memory, world, i)
+        tracking = solve_chosen(frame, memory, world, i, triple, period, require_determined)
+        solved = memory.search[world, i].hypotheses
     if tracking:
         add_prior(memory, world, i)
         memory.search[world, i].attempts += 1
@@ -322,7 +328,7 @@ def begin_hypotheses(frame: BearingFrame, memory: Any, world: int, i: int, perio
 
 
 @subroutine
-def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> bool:
+def update_hypotheses(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> bool:
     """Update the hypotheses by a frame; return whether a single one is left after some frames."""
     frame = set_bearing_measurements(model, state, memory, world, i, now, SEARCH)
     beginning = memory.search[world, i].hypotheses == 0
@@ -346,3 +352,25 @@ def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now:
     prune(memory, world, i)
     single = memory.search[world, i].hypotheses == 1
     return single and memory.search[world, i].tracked_time >= memory.search[world, i].least_time
+
+
+@subroutine
+def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> bool:
+    """Update the hypotheses by a frame; return whether a single one is left after some frames.
+
+    The belief's arrays serve one hypothesis after the other, and then hold the tracked estimate again.
+    """
+    members = memory.belief[world, i].members
+    tracked = own_estimate(memory, world, i)
+    memory.search[world, i].prior = tracked
+    with_errors = memory.P[world, i, 0, ERRORS]
+    with_mounting = memory.P[world, i, 0, MOUNTING]
+    of_calibration = memory.P[world, i, ERRORS, MOUNTING]
+    single = update_hypotheses(model, state, memory, world, i, now)
+    memory.belief[world, i].members = members
+    memory.member[world, i, 0].pose = tracked.pose
+    memory.P[world, i, 0, 0] = tracked.P
+    set_block(memory, world, i, 0, ERRORS, with_errors)
+    set_block(memory, world, i, 0, MOUNTING, with_mounting)
+    set_block(memory, world, i, ERRORS, MOUNTING, of_calibration)
+    return single

@@ -10,6 +10,8 @@ from coopenv.observers.robust.memory import (
     ERRORS,
     SENDER_SLOTS,
     SOURCES,
+    BlockSums,
+    GuardTotals,
     Pose,
     RobustMemory,
     SourceMonitor,
@@ -83,6 +85,7 @@ def clear_drift(memory: Any, world: int, i: int, q: int):
 def clear_source(memory: Any, world: int, i: int, q: int):
     """Clear the information about a source."""
     memory.source[world, i, q].rejected = wp.float64(0.0)
+    memory.source[world, i, q].rejected_time = wp.float64(0.0)
     memory.source[world, i, q].vector = vec3d()
     memory.source[world, i, q].sum = vec3d()
     if is_sender(q):
@@ -104,13 +107,23 @@ def release_slot(memory: Any, world: int, i: int, q: int):
 
 
 @device_function
-def begin_sources(memory: Any, world: int, i: int):
-    """Begin without any information about sources; all are used."""
+def begin_monitors(memory: Any, world: int, i: int):
+    """Begin without any information about the sources."""
     memory.fault_mixture[world, i] = mat66d()
+    memory.belief[world, i].guard = GuardTotals()
     for q in range(SOURCES):
-        release_slot(memory, world, i, q)
+        clear_source(memory, world, i, q)
+        memory.source[world, i, q].guard = BlockSums()
     for k in range(3):
         memory.sensitivity[world, i, PRIOR, 0][k + 3, k] += wp.float64(1.0)
+
+
+@device_function
+def begin_sources(memory: Any, world: int, i: int):
+    """Begin without sources, so that none is excluded."""
+    for q in range(SOURCES):
+        release_slot(memory, world, i, q)
+    begin_monitors(memory, world, i)
 
 
 @device_function
@@ -202,6 +215,19 @@ def note_rejection(memory: Any, world: int, i: int, q: int, weight: Any):
         clear_source(memory, world, i, q)
         memory.source[world, i, q].rejected = rejected
         memory.source[world, i, q].fitted_time = wp.float64(0.0)
+
+
+@device_function
+def note_fit(memory: Any, world: int, i: int, q: int, period: Any):
+    """Note a bearing that passes the gate. A landmark that had failed it comes and goes, without a lasting fault."""
+    memory.source[world, i, q].fitted_time += period
+    if memory.source[world, i, q].rejected_time > wp.float64(0.0):
+        rejected = memory.source[world, i, q].rejected
+        memory.source[world, i, q].rejected_time = wp.float64(0.0)
+        if is_rejected(memory, world, i, q) and not is_sender(q):
+            clear_source(memory, world, i, q)
+            memory.source[world, i, q].rejected = rejected
+            memory.source[world, i, q].ratio = wp.float64(0.0)
 
 
 @device_function

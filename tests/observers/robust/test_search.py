@@ -142,6 +142,45 @@ def test_bearings_to_the_wrong_landmarks_end_in_no_pose() -> None:
         assert observer.memory.search["active"]
 
 
+def driven(truth: Pose, observer: OpenRobust, rng: np.random.Generator, ticks: range) -> Pose:
+    """Drive with two landmarks in view at a time; return where the vehicle is then."""
+    for k in ticks:
+        truth = truth[0] @ PATH[0], truth[1] + truth[0] @ PATH[1]
+        seen = ((0, 1), (2, 3), (1, 4))[k // 10 % 3]
+        observer.update(tick(observer, k, PATH, {n: measured(truth, LANDMARKS[n], rng) for n in seen}))
+    return truth
+
+
+def is_near(observer: OpenRobust, truth: Pose) -> bool:
+    e = left_error(pose_of(observer), truth)
+    return bool(np.linalg.norm(e[:3]) < 0.02 and np.linalg.norm(e[3:]) < 0.1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wide_start_converges_with_two_landmarks_in_a_frame(seed: int) -> None:
+    """Deviations of 25 deg and 0.7 m; no frame has the three bearings that P3P needs."""
+    rng = np.random.default_rng(seed)
+    truth, std = (np.eye(3), np.zeros(3)), np.repeat([0.44, 0.7], 3)
+    observer = started(displaced(truth, std * rng.normal(size=6)), np.diag(std**2))
+    assert observer.message().position is None
+    truth = driven(truth, observer, rng, range(1, 300))
+    assert is_near(observer, truth) and observer.message().position is not None
+
+
+def test_a_loss_ends_with_two_landmarks_in_a_frame() -> None:
+    """After 3 s the vehicle is turned by 40 deg and moved by 1.5 m, which its odometry does not show."""
+    rng = np.random.default_rng(0)
+    truth = (np.eye(3), np.zeros(3))
+    observer = started(truth, np.diag(np.repeat([0.01, 0.05], 3) ** 2))
+    truth = driven(truth, observer, rng, range(1, 180))
+    assert is_near(observer, truth)
+    truth = displaced(truth, np.array([0.0, 0.0, 0.7, 1.2, 0.9, 0.0]))
+    truth = driven(truth, observer, rng, range(180, 181))
+    assert not is_near(observer, truth)
+    truth = driven(truth, observer, rng, range(181, 180 + 15 * 60))
+    assert is_near(observer, truth) and observer.message().position is not None
+
+
 @pytest.mark.parametrize(("angle", "length", "known"), [(0.1, 1.0, True), (0.5, 1.0, False), (0.1, 3.0, False)])
 def test_known_means_small_enough_to_linearise(angle: float, length: float, known: bool) -> None:
     """One axis that is too uncertain is one too many; who is not known says nothing."""
