@@ -17,6 +17,7 @@ Sciences 17(12), 1931.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,7 +78,8 @@ class Guard:
             self.sums = np.pad(self.sums, ((0, 0), (0, more), (0, 0), (0, 0)))
         innovations[~lasting, 1] = innovations[~lasting, 1] > 0.0
         innovations[~lasting, 2] = 0.0
-        np.add.at(self.sums, (slice(None), slots, slice(None), slice(innovations.shape[2])), innovations)
+        places: Any = slice(None), slots, slice(None), slice(innovations.shape[2])
+        np.add.at(self.sums, places, innovations)  # slots may repeat
 
     def end_block(self, length: int, time: float) -> None:
         """Add a block to its totals, and set the factor."""

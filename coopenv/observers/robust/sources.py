@@ -10,6 +10,8 @@ from coopenv.observers.robust.memory import (
     ERRORS,
     SENDER_SLOTS,
     SOURCES,
+    BlockSums,
+    GuardTotals,
     Pose,
     RobustMemory,
     SourceMonitor,
@@ -108,8 +110,10 @@ def release_slot(memory: Any, world: int, i: int, q: int):
 def begin_monitors(memory: Any, world: int, i: int):
     """Begin without any information about the sources."""
     memory.fault_mixture[world, i] = mat66d()
+    memory.belief[world, i].guard = GuardTotals()
     for q in range(SOURCES):
         clear_source(memory, world, i, q)
+        memory.source[world, i, q].guard = BlockSums()
     for k in range(3):
         memory.sensitivity[world, i, PRIOR, 0][k + 3, k] += wp.float64(1.0)
 
