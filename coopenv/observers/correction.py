@@ -23,7 +23,7 @@ While the gate is open, a faulty message is fused.
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import types
@@ -182,14 +182,9 @@ SECOND_ORDER = 0.75
 """Largest mean square of half the square of a normal error, over its squared variance: that of one axis."""
 
 
-class Judgement(NamedTuple):
-    """How the measurements of a frame are judged at a prediction."""
-
-    definite: NDArray[np.bool_]  # (m,) which S are covariances
-    fits: NDArray[np.bool_]  # (m,) which measurements fit
-    rejected: float  # share of the others
-    widest: float  # largest trace, rad^2, of the rows of S that measure an angle
-    innovations: Array  # (m, 3, r) as the guard takes them, second-order errors included
+Judgement = tuple[NDArray[np.bool_], NDArray[np.bool_], float, float, Array]
+"""(m,) which S are covariances, (m,) which measurements fit, the share of the others, the largest trace, rad^2, of the
+rows that measure an angle, and (m, 3, r) the innovations as the guard takes them, second-order errors included."""
 
 
 class InnovationGate:
@@ -250,7 +245,7 @@ def judged(
                 innovations[n, 0, k] = min(max(residual[n, k] / math.sqrt(of_row), -MOST_DEVIATIONS), MOST_DEVIATIONS)
                 innovations[n, 1, k] = min(variance[n, k] / of_row, 1.0)
                 innovations[n, 2, k] = math.sqrt(1.0 - innovations[n, 1, k])
-    return Judgement(definite, fits, 1.0 - np.count_nonzero(fits) / len(fits), widest, innovations)
+    return definite, fits, 1.0 - np.count_nonzero(fits) / len(fits), widest, innovations
 
 
 PLACES = types.Array(types.int64, 1, "A", readonly=True)

@@ -28,6 +28,8 @@ LENGTHS = (1.0, 4.0)  # s, of blocks
 WINDOW = 10.0  # s: time constant of the totals
 MOST_DEVIATIONS = 3.29  # to which innovations are limited: one of a thousand is larger
 NORMAL_QUANTILE = 4.75  # that a normal variable exceeds with a probability of 1e-6
+LATENCY = 0.03
+"""s, of frames, that a protection level includes although no noise declares it: two periods of a camera of 60 Hz."""
 UNKNOWN = 4.0
 """Factor from which on a protection level is unknown: the stated deviations are half of what innovations show."""
 

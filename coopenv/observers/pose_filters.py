@@ -138,7 +138,7 @@ class Mekf(PoseObserver):
             if self.guarded:
                 last = (measured.targets >= len(tick.landmarks)) | (measured.entries["covariance"][:, 3, 3] > 0.0)
                 last |= self.lasting.estimated < len(self.lasting.states)
-                self.guard.add(tick.time, measured.targets, judgement.innovations, last)
+                self.guard.add(tick.time, measured.targets, judgement[-1], last)
             if not kept.all():
                 measured = measured.only(kept)
         if len(measured.entries):

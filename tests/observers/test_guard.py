@@ -81,11 +81,11 @@ def test_one_source_of_several_may_be_wrong() -> None:
 def test_innovations_are_limited_to_one_of_a_thousand() -> None:
     """A measurement that its gate refuses counts as one at the gate."""
     every, S = np.ones((2, 2), bool), np.tile(1e-4 * np.eye(2), (2, 1, 1))
-    judgement = judged(np.array([[1.0, -1.0], [1e-3, 0.0]]), S, np.full((2, 2), 4e-5), every, every, every[0])
+    *_, innovations = judged(np.array([[1.0, -1.0], [1e-3, 0.0]]), S, np.full((2, 2), 4e-5), every, every, every[0])
     limit = norm.isf(5e-4)
-    assert_allclose(judgement.innovations[:, 0], [[limit, -limit], [0.1, 0.0]], rtol=1e-3)
-    assert_allclose(judgement.innovations[:, 1], 0.4, rtol=1e-3)
-    assert_allclose(judgement.innovations[:, 2] ** 2, 0.6, rtol=1e-3)
+    assert_allclose(innovations[:, 0], [[limit, -limit], [0.1, 0.0]], rtol=1e-3)
+    assert_allclose(innovations[:, 1], 0.4, rtol=1e-3)
+    assert_allclose(innovations[:, 2] ** 2, 0.6, rtol=1e-3)
 
 
 def test_what_was_not_measured_counts_nothing() -> None:

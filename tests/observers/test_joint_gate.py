@@ -135,7 +135,7 @@ def test_the_second_order_error_of_a_wide_prior_refuses_nothing(
 def test_measurements_that_contradict_each_other_open_the_gate() -> None:
     """If most of them are refused jointly, the pose is wrong."""
     gate = InnovationGate()
-    judgement = Judgement(np.ones(3, bool), np.ones(3, bool), 0.0, 0.0, np.zeros((3, 3, 2)))
+    judgement: Judgement = np.ones(3, bool), np.ones(3, bool), 0.0, 0.0, np.zeros((3, 3, 2))
     opened = []
     for k in range(1, 121):
         gate.passed(k / 60.0, judgement)

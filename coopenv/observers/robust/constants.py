@@ -58,9 +58,6 @@ MODEL_ERROR = 0.05
 equally likely. Chosen."""
 MONITOR_TIME = 10.0  # s: time constant of the sums of a monitor. Chosen
 OWN_FAULT = 0.1  # deviation of a fault of velocity and focal length, as a share, gyro, rad/s, and camera, rad. Chosen
-UNDECLARED_LATENCY = 0.03
-"""s, of frames, that a protection level includes although no noise declares it: two periods of a camera of 60 Hz, one
-of exposure and transfer and one of waiting. Chosen."""
 LOST_SHARE, FOUND_SHARE = 0.6, 0.2
 """Share of bearings that fail the gate from which on all bearings count, and share below which the gate counts again
 and the pose is an anchor. Chosen: one wrong association of two does not exceed the first."""

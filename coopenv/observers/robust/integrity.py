@@ -31,7 +31,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import block3
-from coopenv.observers.guard import UNKNOWN
+from coopenv.observers.guard import LATENCY, UNKNOWN
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import KNOWN_ANGLE_VARIANCE, KNOWN_POSITION_VARIANCE, diagonal_by_rows
 from coopenv.observers.robust.memory import (
@@ -416,5 +416,5 @@ def protection_level(memory: Any, world: int, i: int):
             ):
                 return vec2d(wp.float64(wp.inf))
             most = wp.max(most, levels(up, variances, Phi * memory.source[world, i, q].offset))
-    most[0] += wp.float64(constants.UNDECLARED_LATENCY) * wp.length(memory.belief[world, i].mean_v)
+    most[0] += wp.float64(LATENCY) * wp.length(memory.belief[world, i].mean_v)
     return most
