@@ -195,7 +195,7 @@ def _dated(bearings: NDArray[Any], tick: Tick) -> Array:
     R = exp_so3(turn)
     bearings["value"][:, :3] = bearings["value"][:, :3].dot(R.T)
     bearings["position"] -= tick.bearing_age * bearings["velocity"]
-    return R.dot(np.asarray(tick.lever_arm, float)) + shift
+    return np.asarray(R.dot(np.asarray(tick.lever_arm, float)) + shift)
 
 
 def _put_accuracy(entries: NDArray[Any], n: int, tick: Tick) -> None:

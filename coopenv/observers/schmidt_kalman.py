@@ -281,7 +281,7 @@ def complete(joint: Array, own: int, still: Sequence[bool]) -> None:
         still: (k,) which neighbours are landmarks; the errors of two landmarks are independent.
     """
     at = [slice(k, k + 6) for k in range(own, len(joint), 6)]
-    known = joint[own:, own:].reshape(len(at), 6, len(at), 6).any(axis=(1, 3))
+    known = np.asarray(joint[own:, own:].reshape(len(at), 6, len(at), 6).any(axis=(1, 3)))
     for a in range(len(at)):
         for b in range(a):
             between = np.flatnonzero(known[a] & known[b])
