@@ -116,7 +116,7 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
         "senders' drifts": [(fault_hypotheses, "exclude_drifting", no_drift)],
         "covariance of likely faults": [(fault_hypotheses, "set_fault_mixture", no_mixture)],
         "readmission": [(observer, "test_excluded", no_readmission)],
-        "all bearings when lost": [(constants, "LOST_SHARE", 2.0)],
+        "restarts when lost": [(constants, "LOST_SHARE", 2.0)],
         "gyro bias": [(constants, "GYRO_BIAS", 1e-6), (constants, "GYRO_BIAS_WALK", 1e-6)],
         "senders' increments": [(correlated_fusion, "apply_sender_increment", no_increment)],
         "linearisation variance": [

@@ -163,7 +163,7 @@ def test_a_wide_start_converges_with_two_landmarks_in_a_frame(seed: int) -> None
     truth, std = (np.eye(3), np.zeros(3)), np.repeat([0.44, 0.7], 3)
     observer = started(displaced(truth, std * rng.normal(size=6)), np.diag(std**2))
     assert observer.message().position is None
-    truth = driven(truth, observer, rng, range(1, 300))
+    truth = driven(truth, observer, rng, range(1, 480))
     assert is_near(observer, truth) and observer.message().position is not None
 
 
