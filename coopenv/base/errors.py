@@ -54,6 +54,11 @@ class UserCodeError(CoopenvError):
     """A user's sensor or drive cannot be used, or has raised something; the message names file, class and function."""
 
 
+def is_of_user(error: BaseException | None) -> bool:
+    """Return whether a user's sensor or drive has caused an error."""
+    return isinstance(error, UserCodeError) or (error is not None and isinstance(error.__cause__, UserCodeError))
+
+
 class ScenarioWarning(UserWarning):
     """The scenario is possible but the theory's conditions may not hold."""
 

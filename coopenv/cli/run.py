@@ -140,7 +140,7 @@ def record(given: RecordOptions) -> None:
     if given.topics is not None and "topics" not in kind.options:
         raise CoopenvError(f"--map {given.topics}: is for ROS bags, {environment} is none")
     refuse_for_recordings(environment, given.seed, given.policy)
-    log, played = options.console(stderr=True), None
+    log, played, failures = options.console(stderr=True), None, list[CoopenvError]()
     if kind.reader:
         if allow_kinds(given.changes):
             raise CoopenvError(f"--override: is for a simulation, {environment} is recorded")
@@ -148,12 +148,16 @@ def record(given: RecordOptions) -> None:
     else:
         backend = given.open()
         with Progress(log, "recording", total=1.0) as progress:
-            episode = record_episode(backend, given.seed, given.policy, progress.update, name=out.name)
+            episode = record_episode(
+                backend, given.seed, given.policy, progress.update, name=out.name, on_failure=failures.append
+            )
         recording, played = episode.measured, episode.drawn(frame_stride(episode.scenario))
     write_log(recording, out, log, observer, given.scene)
     count = len(recording.setups)
     facts = f"{count} vehicle{'' if count == 1 else 's'}, {recording.ticks} ticks, {recording.t[-1]:g} s"
     options.console().print(f"{out}: {facts}", soft_wrap=True)
+    if failures:
+        raise CoopenvError(f"{failures[0]} (the {recording.t[-1]:g} s before it are in {out})") from failures[0]
     if given.no_replay or not pages_can_be_written(page, log):
         return
     if played is None:

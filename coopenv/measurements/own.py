@@ -107,7 +107,7 @@ class OwnKind(Kind):
 
     def _try(self) -> None:
         """Find the shapes at a few random places, and compare a given Jacobian with differences."""
-        for own, target in self._trials():
+        for own, target in self.trials():
             value = self._numbers("predict", self._call("predict", self.own.predict, own, target))
             self.size = len(value)
             change: Any = value
@@ -126,7 +126,7 @@ class OwnKind(Kind):
             if hasattr(self.own, "jacobian"):
                 self._compare(own, target)
 
-    def _trials(self) -> list[tuple[Placed, Placed]]:
+    def trials(self) -> list[tuple[Placed, Placed]]:
         """Return random places at which the class measures; the first ones if there are hardly any."""
         rng = np.random.default_rng(0)
         pairs = [(placed_at_random(rng), placed_at_random(rng)) for _ in range(PLACES)]

@@ -51,12 +51,19 @@ _of_users: list[WarpFunctions] = []
 
 
 def number_of(reference: str, kind: Kind) -> int:
-    """Return the number of a kind in kernels: users' kinds follow on the table; -1: without Warp functions."""
+    """Return the number of a kind in kernels: users' kinds follow on the table; -1: without Warp functions.
+
+    Raises:
+        CoopenvError: a Warp function of a user's kind does not do what the class does in NumPy.
+    """
     if reference in KINDS:
         return [*KINDS].index(reference)
     if kind.in_warp is None:
         return -1
     if kind.in_warp not in _of_users:
+        from coopenv.measurements.own_in_warp import check_in_warp  # which most programs do not need
+
+        check_in_warp(kind)
         _of_users.append(kind.in_warp)
     return len(KINDS) + _of_users.index(kind.in_warp)
 

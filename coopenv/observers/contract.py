@@ -135,9 +135,9 @@ class Setup:
     sensors: tuple[Sensor, ...] = ()  # beside the camera
     landmark_rotation: Array | None = None
     """(L, 3, 3) of the landmarks on the map, NaN for those that move; None: no sensor measures an orientation."""
-    landmark_std: Array | None = None
+    landmark_std: tuple[float, ...] = ()
     """(L,) accuracy of the map: standard deviations of the landmarks' positions per axis, m, the same error for all
-    vehicles; None: exact."""
+    vehicles; empty: exact."""
 
 
 @dataclass(frozen=True)

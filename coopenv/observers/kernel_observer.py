@@ -63,7 +63,9 @@ def model_of(setup: Setup, p: Precision) -> Any:
     noise.gyro_bias, noise.gyro_bias_walk = p.vec3(*known.gyro_bias), p.vec3(*known.gyro_bias_walk)
     noise.slip_rate, noise.slip_duration, noise.slip_size, noise.slip_angle = known.slip
     camera.orientation_std, camera.position_std = known.camera_orientation, known.camera_position
-    camera.focal_std = known.focal_length
+    camera.focal_std, camera.orientation_walk = known.focal_length, known.camera_orientation_walk
+    camera.latency_std, camera.latency_jitter = known.latency, known.latency_jitter
+    model.landmark_std = wp.array(setup.landmark_std or np.zeros(L), dtype=p.scalar, device="cpu")
     fault = entry_struct(p, "fault")()
     fault.clock = known.clock_offset
     for name, entry in (("fault", fault), ("camera", camera), ("noise", noise)):
@@ -203,6 +205,7 @@ class KernelObserver:
         s.increment_rotation[...], s.increment_translation[...] = tick.rotation, tick.translation
         s.odometry_velocity[...], s.odometry_angular_velocity[...] = tick.velocity, tick.angular_velocity
         s.position[: self.setup.landmarks] = tick.landmarks
+        s.bearing_age[...] = tick.bearing_age
         s.sight[tick.targets] = np.where(tick.valid, _VISIBLE, _OUT_OF_VIEW)
         seen = tick.targets[tick.valid]
         s.bearing[seen], s.bearing_tick[seen] = tick.bearings[tick.valid] @ self._camera, now

@@ -368,6 +368,9 @@ def _check_setup(setup: Setup, vehicle: int, first: Setup, where: str) -> None:
     for name, count in (("q", len(setup.target_names)), ("V", 2), ("P0", 2)):
         positive = _is_array(getattr(gains, name), (count,)) and np.min(getattr(gains, name)) > 0.0
         _require(positive, f"{where}.gains.{name}: not {count} positive numbers")
+    std = setup.landmark_std
+    valid = len(std) in (0, setup.landmarks) and min(std, default=0.0) >= 0.0 and max(std, default=0.0) <= LARGEST
+    _require(valid, f"{where}.landmark_std: not {setup.landmarks} numbers in 0 .. {LARGEST:g}")
     for problem in problems_of_sensors(setup, first):
         raise DataError(f"{where}.sensors.{problem}")
 

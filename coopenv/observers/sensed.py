@@ -46,6 +46,7 @@ class Measurements:
     visible: NDArray[np.bool_]  # (..., N, T)
     landmarks: Array  # (..., L, 3) map, m
     pan: Array | None = None  # (..., N) rad, by which cameras are turned to the left; None: 0
+    bearing_age: Array | None = None  # (..., N) s since the frame was exposed; None: 0
     readings: Mapping[str, Array] = field(default_factory=dict)
     """(..., N, T, size) of each sensor beside the camera, by its name; (..., N, 1, size) of one that measures the map.
     NaN where nothing was measured."""
@@ -81,7 +82,6 @@ class Sensed(Measurements):
     due: bool = True  # whether the scenario's observer rate asks for a correction
     time: float | None = None  # s since the reset on the source's clock; None: index * dt
     odometry_age: Array | None = None  # (N,) s since the last odometry sample; None: 0
-    bearing_age: Array | None = None  # (N,) s since the frame was exposed; None: 0
     missing: NDArray[np.bool_] | None = None  # (N,) vehicles without data; None: none
     late: NDArray[np.bool_] | None = None  # (N,) vehicles with data after the deadline; None: none
     truth: Truth | None = None  # of this tick; None: not known
@@ -116,6 +116,7 @@ class Sensed(Measurements):
             readings=tuple(self.reading(setup, sensor) for sensor in setup.sensors),
             landmark_rotation=setup.landmark_rotation,
             landmark_names=setup.target_names[: setup.landmarks],
+            bearing_age=0.0 if self.bearing_age is None else float(self.bearing_age[i]),
         )
 
     def reading(self, setup: Setup, sensor: Sensor) -> Reading:

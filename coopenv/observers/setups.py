@@ -37,6 +37,7 @@ def observer_init_of(scenario: Scenario, model: Any) -> ObserverInit:
             optical_axis=_in_body(cameras[i], (0.0, 0.0, 1.0)),
             sensors=sensors_of(s, i, sets[i]),
             landmark_rotation=landmark_rotations(s) if s.sensors else None,
+            landmark_std=s.landmark_std,
         )
         for i, name in enumerate(s.vehicle_names)
     )
@@ -92,13 +93,17 @@ def _in_body(camera: Any, direction: tuple[float, float, float]) -> tuple[float,
 
 
 def _noise_of(scenario: Scenario, vehicle: int, camera: Any, noise: Any) -> SensorNoise:
-    """Return the noise of one vehicle from its entries of the model; rounded pixels add to that of bearings."""
+    """Return the noise of one vehicle from its entries of the model.
+
+    Rounded pixels add to that of bearings, and so does a correlated error, as white noise that averages as it does.
+    """
     bearing, axis = float(noise["bearing"]), None
     if noise["bearing_paper"]:
         bearing /= math.sqrt(3.0)
         axis = _in_body(camera, scenario.noises[vehicle].bearing.axis)
     if camera["quantise"]:
         bearing = math.hypot(bearing, 1.0 / (math.sqrt(12.0) * float(camera["focal_length"].min())))
+    bearing = math.hypot(bearing, float(noise["bearing_counted"]))
     rate, duration, size, angle = (float(noise[f"slip_{name}"]) for name in ("rate", "duration", "size", "angle"))
     return SensorNoise(
         velocity=float(noise["velocity"]),
@@ -111,6 +116,9 @@ def _noise_of(scenario: Scenario, vehicle: int, camera: Any, noise: Any) -> Sens
         camera_orientation=float(camera["orientation_std"]),
         camera_position=float(camera["position_std"]),
         focal_length=float(camera["focal_std"]),
+        latency=float(camera["latency_std"]),
+        latency_jitter=float(camera["latency_jitter"]),
+        camera_orientation_walk=float(camera["orientation_walk"]),
         clock_offset=scenario.all_faults[vehicle].clock_offset,
         odometry_period=1.0 / scenario.rates.odometry,
         bearing=bearing,

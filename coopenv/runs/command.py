@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
 
-from coopenv.base.errors import CoopenvError, DataError, UserCodeError, explained, listed
+from coopenv.base.errors import CoopenvError, DataError, explained, is_of_user, listed
 from coopenv.base.files import replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import install_command
@@ -131,7 +131,7 @@ def _played(
             if tick % stride == 0:
                 progress.update(tick, describe() if describe is not None else None)
     except CoopenvError as error:
-        if not isinstance(error, UserCodeError) and not isinstance(error.__cause__, UserCodeError):
+        if not is_of_user(error):
             raise
         return error
     return None

@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 
 from coopenv.api.engine import Engine
+from coopenv.base.errors import CoopenvError, is_of_user
 from coopenv.episode import RECORDED, Episode, Origin, Views
 from coopenv.evaluation.episodes import play
+from coopenv.observers.arrays import recorded_names
 from coopenv.observers.faults import Interference, interference_of, stacked
 from coopenv.observers.recording import Drawn, Recording
-from coopenv.observers.sensed import Sensed, Truth, is_due
+from coopenv.observers.sensed import MEASURED, Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
 from coopenv.scenario import ScenarioLike
 from coopenv.sources.base import Backend
@@ -58,11 +60,15 @@ def record_episode(
     on_tick: Callable[[Engine, int], None] = lambda engine, tick: None,
     name: str = "",
     fields: Sequence[str] = RECORDED,
+    on_failure: Callable[[CoopenvError], None] | None = None,
 ) -> Episode:
     """Return the episode of a backend with its recording.
 
-    Arguments are those of `record`, and `name`, which stands in its heading, and the fields of the engine that are
-    recorded, at least `OF_RECORDING`.
+    Arguments are those of `record`, and:
+        name: stands in its heading.
+        fields: of the engine that are recorded, at least `OF_RECORDING`.
+        on_failure: called with the error of a user's sensor or drive that ends the episode after its first tick; None:
+            the error is raised.
     """
     backend = source if isinstance(source, Backend) else open_backend(source, None, {})
     scenario = backend.scenario
@@ -72,17 +78,23 @@ def record_episode(
     ticks: list[Sensed] = []
     faults: list[Interference | None] = []
     drawn = None
-    for k in play(engine, [seed], scenario.horizon_ticks, driver if scenario.driven else None):
-        views.take()
-        if k == 0 and backend.capabilities.batched:
-            key, number, parameters = (engine.view(name)[0].tolist() for name in ("seed", "episode", "parameter"))
-            drawn = Drawn(key, number, tuple(parameters))
-        ticks.append(engine.world.sensed(0, k))
-        faults.append(interference_of(scenario, engine.world.model, engine.view, 0, k))
-        on_tick(engine, k)
-        on_progress(k / scenario.horizon_ticks)
+    try:
+        for k in play(engine, [seed], scenario.horizon_ticks, driver if scenario.driven else None):
+            views.take()
+            if k == 0 and backend.capabilities.batched:
+                key, number, parameters = (engine.view(name)[0].tolist() for name in ("seed", "episode", "parameter"))
+                drawn = Drawn(key, number, tuple(parameters))
+            ticks.append(engine.world.sensed(0, k))
+            faults.append(interference_of(scenario, engine.world.model, engine.view, 0, k))
+            on_tick(engine, k)
+            on_progress(k / scenario.horizon_ticks)
+    except CoopenvError as error:
+        if on_failure is None or not ticks or not is_of_user(error):
+            raise
+        on_failure(error)
     L, observer_init = len(scenario.landmarks), engine.world.observer_init
-    kept: dict[str, Any] = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in ticks[0].measured()}
+    names = [name for name in recorded_names(scenario) if name in MEASURED]
+    kept: dict[str, Any] = {name: np.stack([tick.filled(name) for tick in ticks]) for name in names}
     episode = views.episode(scenario, source_of(engine, name, seed, policy if isinstance(policy, str) else "custom"))
     recording = Recording(
         setups=observer_init.setups,

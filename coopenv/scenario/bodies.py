@@ -236,6 +236,8 @@ class Landmark(Section):
     """True for a radio, which cameras do not see."""
     marker: Annotated[Vector3, units.LENGTH] = (0.0, 0.0, 0.0)
     """The point that cameras see, in the landmark's body frame, m."""
+    accuracy: Annotated[NonNegative | None, units.DETAIL] = None
+    """Accuracy of its position on the map, m (default: `map.accuracy`)."""
 
     @property
     def is_drawn(self) -> bool:

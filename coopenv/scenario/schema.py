@@ -13,8 +13,8 @@ from pydantic import Field, field_validator, model_validator
 
 from coopenv.base.errors import ScenarioError, ScenarioWarning, check_one_of, listed, shown, suggest
 from coopenv.base.installation import load_reference
-from coopenv.base.sections import Positive, Section, Text, Vector3, overlaid, validated
-from coopenv.base.units import EPISODE, PLACE, TIME, warn_of_implausible
+from coopenv.base.sections import NonNegative, Positive, Section, Text, Vector3, overlaid, validated
+from coopenv.base.units import DETAIL, EPISODE, PLACE, TIME, warn_of_implausible
 from coopenv.motions.table import DRIVES, columns_of, further_bodies
 from coopenv.report.notebook import facts_html, one_line, picture_html
 from coopenv.scenario.bodies import MOST_LANDMARKS, Landmark, LandmarkGroup, Obstacle, Road, Vehicle
@@ -57,6 +57,9 @@ class Map(Section):
 
     origin: Annotated[Vector3, PLACE] = (0.0, 0.0, 0.0)
     """Point of this file's coordinates at which the map frame has its origin; keep it inside the scene."""
+    accuracy: Annotated[NonNegative, DETAIL] = 0.0
+    """Standard deviation per axis of the error of a landmark's position on the map, m; drawn per episode, the same for
+    all vehicles. Cameras see the landmark in its true place."""
 
 
 class _Loaded(type(Section)):  # type: ignore[misc]
@@ -219,6 +222,13 @@ class Scenario(Section, metaclass=_Loaded):
         """True if any vehicle's odometry or camera has lasting errors, see `[noise]` and `[camera]`."""
         noises, cameras = self.noises, self.cameras
         return any(n.enabled and (n.lasts or c.is_misplaced) for n, c in zip(noises, cameras, strict=True))
+
+    @property
+    def landmark_std(self) -> tuple[float, ...]:
+        """(L,) standard deviations per axis of the landmarks' positions on the map, m; empty: exact."""
+        common = self.map.accuracy
+        std = tuple(common if mark.accuracy is None else mark.accuracy for mark in self.landmarks)
+        return std if self.noise.enabled and any(std) else ()
 
     @property
     def cameras(self) -> list[Camera]:

@@ -99,6 +99,15 @@ class Camera(Section):
     focal_length_error: Annotated[NonNegative, units.SHARE] = 0.0
     """Standard deviation of e: the true focal length is (1 + e) times the known one, so that the coordinates of a
     bearing on the image plane (at distance 1) are (1 + e) times what they should be; drawn per vehicle and episode."""
+    extrinsics_walk: Annotated[NonNegative, units.SMALL_ANGLE] = 0.0
+    """Random walk of that rotation, standard deviation per axis, rad per square root of a second."""
+    latency: Annotated[NonNegative, units.LAG] = 0.0
+    """Age of a frame when its bearings are used, s; observers know it."""
+    latency_error: Annotated[NonNegative, units.LAG] = 0.0
+    """Standard deviation of an error of the latency, s; drawn per vehicle and episode. Frames may thereby be ahead of
+    the odometry."""
+    latency_jitter: Annotated[NonNegative, units.LAG] = 0.0
+    """Standard deviation of a further error, drawn for every frame, s."""
 
     def to_body(self, pan: float = 0.0) -> np.ndarray:
         """Return the rotation (3, 3) from the nominal optical frame to the body, for a pan angle to the left, rad."""
@@ -109,7 +118,13 @@ class Camera(Section):
     @property
     def is_misplaced(self) -> bool:
         """True if the true camera differs from the nominal one."""
-        return any((self.extrinsics_error, self.extrinsics_position_error, self.focal_length_error))
+        turned = self.extrinsics_error, self.extrinsics_walk
+        return any((*turned, self.extrinsics_position_error, self.focal_length_error))
+
+    @property
+    def is_late(self) -> bool:
+        """True if its frames have an age."""
+        return any((self.latency, self.latency_error, self.latency_jitter))
 
 
 class Images(Section):
@@ -152,6 +167,15 @@ class Rates(Section):
         return self
 
 
+class CorrelatedBearing(Section):
+    """An error of a bearing that changes slowly: a Gauss-Markov process of first order, of its own for every target."""
+
+    std: Annotated[NonNegative, units.SMALL_ANGLE] = 0.0
+    """Standard deviation of each tangent axis, rad."""
+    time: Annotated[Positive, units.TIME] = 10.0
+    """Correlation time, s."""
+
+
 class BearingNoise(Section):
     """Noise of a bearing."""
 
@@ -164,6 +188,7 @@ class BearingNoise(Section):
     """Optical axis of the paper's formula, in the camera frame."""
     rate: Annotated[Rate | Sample, units.FREQUENCY] = "sample"
     """Camera rate in Hz at which the scale holds (other rates keep its density), or `sample`: at any rate."""
+    correlated: CorrelatedBearing = CorrelatedBearing()
 
 
 class Slip(Section):
@@ -183,7 +208,7 @@ class Noise(Section):
     """Measurement noise, and errors of the odometry that last."""
 
     enabled: bool = True
-    """False switches off all noise and errors of odometry, bearings and cameras."""
+    """False switches off all noise and errors of odometry, bearings, cameras and the map."""
     velocity: Annotated[NonNegative, units.SPEED_ERROR] = 0.0
     """Standard deviation of each component of a linear velocity sample, m/s."""
     angular_velocity: Annotated[NonNegative, units.TURN_RATE_ERROR] = 0.0

@@ -17,7 +17,7 @@ from coopenv.observers.sensed import MEASURED, Sensed, Truth
 from coopenv.scenario import Scenario
 from coopenv.scenario.difficulty import PARAMETERS
 from coopenv.world.camera import MISSED, OUT_OF_VIEW, VISIBLE, camera_to_body, marker_position, sight_of
-from coopenv.world.dynamics import move
+from coopenv.world.dynamics import move, remember
 from coopenv.world.embedded import Source, arrange_world, begin_sensing, look_around, sense_nothing
 from coopenv.world.model import Precision
 from coopenv.world.nearby import NOT_A_NEIGHBOUR, sort_into_cells
@@ -60,6 +60,7 @@ def forget_errors(state: Any, world: int, vehicle: int):
     state.camera_turn[world, vehicle] = unknown
     state.camera_shift[world, vehicle] = unknown
     state.camera_focal[world, vehicle] = unknown[0]
+    state.camera_delay[world, vehicle] = unknown[0]
 
 
 @wp.func
@@ -112,6 +113,7 @@ def recall(model: Any, state: Any, record: Any, world: int, tick: int):
         state.odometry_angular_velocity[world, vehicle] = record.angular_velocity[row, vehicle]
         state.odometry_samples[world, vehicle] = record.samples[row, vehicle]
         state.pan[world, vehicle] = record.pan[row, vehicle]
+        state.bearing_age[world, vehicle] = record.bearing_age[row, vehicle]
         to_camera = wp.transpose(model.camera[vehicle].rotation)
         for target in range(model.agents):
             state.sight[world, vehicle, target] = NOT_A_NEIGHBOUR
@@ -175,6 +177,7 @@ def rewind(model: Any, state: Any, record: Any, world: int):
             state.estimate_rotation[world, vehicle] = R
             state.estimate_position[world, vehicle] = wp.transpose(R) * record.start_position[vehicle]
     recall(model, state, record, world, 0)
+    remember(model, state, world, 0)
     for vehicle in range(model.vehicles):
         state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
 
@@ -199,7 +202,8 @@ def record_struct(p: Precision) -> Any:
         angular_velocity: array("KN", vec3)  # rad/s
         samples: array("KN", wp.int32)  # odometry samples so far
         bearings: array("KNT", vec3)  # body frame
-        bearing_lag: array("KN", wp.int32)  # ticks since the frame was exposed
+        bearing_age: array("KN", p.scalar)  # s since the frame was exposed
+        bearing_lag: array("KN", wp.int32)  # likewise, ticks
         visible: array("KNT", wp.uint8)
         pan: array("KN", p.scalar)  # rad
         reading: array("KNRT", p.vec6)  # of sensors beside the camera; NaN: not measured

@@ -38,6 +38,7 @@ EXACT = {
     "v2x": "coopenv_msgs/msg/Inbox",
     "truth_exact": "coopenv_msgs/msg/Truth",
     "pan": "coopenv_msgs/msg/Pan",
+    "bearing_age": "coopenv_msgs/msg/Age",
 }
 """Topics of a vehicle that hold the recording, one message a tick."""
 
@@ -45,6 +46,7 @@ CONTENTS = {
     "increment": {name: name for name in ("rotation", "translation", "velocity", "angular_velocity")},
     "bearings": {},
     "pan": {"angle": "pan"},
+    "bearing_age": {"age": "bearing_age"},
     "v2x": {"tick_sent": "inbox_tick"},
     "truth_exact": {"rotation": "truth.rotation", "position": "truth.position"},
 }
@@ -124,8 +126,11 @@ SetupHeader = create_model(
     ),
     planar=(bool, False),  # earlier versions wrote it: true of robots on a plane whose odometry is their commands
 )
-ONLY_WITH_SENSORS = ("sensors", "landmark_rotation")
-"""Entries of a setup that the header of a recording without sensors beside cameras does not have."""
+OPTIONAL: dict[type, dict[str, Any]] = {
+    of: {field.name: field.default for field in fields(of) if field.default in ((), None, 0.0)}
+    for of in (Setup, SensorNoise)
+}
+"""Entries that a header has only if they are not empty; versions without them read the others' headers."""
 
 
 class RecordingHeader(Section):
@@ -163,17 +168,22 @@ class RecordingHeader(Section):
 def header_of(recording: Recording) -> bytes:
     """Return the header of a recording as JSON."""
     values = jsonable({name: getattr(recording, name) for name in RecordingHeader.model_fields})
-    for setup in values["setups"] if not recording.readings else ():
-        for name in ONLY_WITH_SENSORS:
-            del setup[name]
-    for setup in values["setups"] if recording.readings else ():
-        for sensor in setup["sensors"]:
+    for setup in values["setups"]:
+        setup["noise"] = _without_empty(SensorNoise, setup["noise"])
+    values["setups"] = [_without_empty(Setup, setup) for setup in values["setups"]]
+    for setup in values["setups"]:
+        for sensor in setup.get("sensors", ()):
             sensor["reference"] = name_in_logs(sensor["reference"])
     if values["scenario"] is not None:
         values["scenario"] = without_own_terms(values["scenario"])
         for sensor in values["scenario"].get("sensors", ()):
             sensor["kind"] = name_in_logs(sensor["kind"])
     return json.dumps(values, separators=(",", ":")).encode()
+
+
+def _without_empty(of: type, entries: dict[str, Any]) -> dict[str, Any]:
+    empty = OPTIONAL[of]
+    return {name: value for name, value in entries.items() if name not in empty or value != jsonable(empty[name])}
 
 
 def _scenario_of(raw: Mapping[str, Any], where: str) -> Scenario:

@@ -58,8 +58,11 @@ class SimulatedWorld(SensingWorld):
             "visible": visible,
             "landmarks": position + (R @ self._markers)[..., 0],
         }
-        if ARRAYS["pan"].present(self.scenario):
-            arrays["pan"] = self._copy("pan", world)
+        if self.model.map_errors:
+            arrays["landmarks"] += self._copy("map_offset", world)[:L]
+        for name in ("pan", "bearing_age"):
+            if ARRAYS[name].present(self.scenario):
+                arrays[name] = self._copy(name, world)
         for values in arrays.values():
             values.setflags(write=False)
         due = bool(is_due(k, self.model.observer.rate / rates.camera))
@@ -200,11 +203,15 @@ def _of_robots(recording: Recording, name: str) -> dict[str, Any]:
         raise DataError(f"{name}: its corrections are not due at a fixed rate")
     staleness = recording.staleness if math.isfinite(recording.staleness) else None
     points = zip(targets[: first.landmarks], recording.landmarks[0].tolist(), strict=True)
+    accuracies = first.landmark_std or [None] * first.landmarks
     starts = zip(recording.setups, recording.start_position.tolist(), strict=True)
     return {
         "title": name,
         "horizon": (recording.ticks - 1) * recording.dt,
-        "landmarks": [{"name": target, "position": position} for target, position in points],
+        "landmarks": [
+            {"name": target, "position": position, "accuracy": std}
+            for (target, position), std in zip(points, accuracies, strict=True)
+        ],
         "vehicles": [
             {
                 "initial_pose": {"position": position},
@@ -218,7 +225,10 @@ def _of_robots(recording: Recording, name: str) -> dict[str, Any]:
             "orientation": "body",
             "extrinsics_error": noise.camera_orientation,
             "extrinsics_position_error": noise.camera_position,
+            "extrinsics_walk": noise.camera_orientation_walk,
             "focal_length_error": noise.focal_length,
+            "latency_error": noise.latency,
+            "latency_jitter": noise.latency_jitter,
         },
         "rates": {
             "camera": rate,

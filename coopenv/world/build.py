@@ -11,6 +11,7 @@ from coopenv.base.errors import ScenarioError
 from coopenv.base.sections import Section
 from coopenv.estimation import KINDS, Outcome
 from coopenv.estimation.lens import largest_radius
+from coopenv.measurements.sensor import averaged_std
 from coopenv.motions.table import DRIVES, MOTIONS, columns_of
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Vehicle
@@ -123,7 +124,7 @@ def _unit(direction: tuple[float, float, float] | None) -> np.ndarray:
     return np.zeros(3) if direction is None else np.array(direction) / np.linalg.norm(direction)
 
 
-def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
+def camera_entries(c: Camera, noise: Noise, rates: Rates) -> dict[str, Any]:
     """Return the values of the model's `CameraValues` that differ from the camera's own."""
     on = float(noise.enabled)
     return {
@@ -135,6 +136,11 @@ def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
         "orientation_std": on * c.extrinsics_error,
         "position_std": on * c.extrinsics_position_error,
         "focal_std": on * c.focal_length_error,
+        "changes": c.latency > 0.0 or (noise.enabled and (c.is_late or c.extrinsics_walk > 0.0)),
+        "orientation_walk": on * c.extrinsics_walk,
+        "latency_std": on * c.latency_error,
+        "latency_jitter": on * c.latency_jitter,
+        "latency_ticks": round(c.latency / (1.0 / rates.camera)),
     }
 
 
@@ -146,11 +152,15 @@ def noise_entries(n: Noise, rates: Rates) -> dict[str, Any]:
     if abs(axis[2]) > 1 - 1e-12:
         first = np.array([1.0, 0.0, 0.0])
     first = first / np.linalg.norm(first)
+    correlated, time = np.array(on * n.bearing.correlated.std), n.bearing.correlated.time
     return {
         "velocity": on * _at_rate(n.velocity, n.odometry_rate, rates.odometry),
         "angular_velocity": on * _at_rate(n.angular_velocity, n.odometry_rate, rates.odometry),
         "bearing_paper": n.bearing.model == "paper",
         "bearing": on * _at_rate(n.bearing.scale, n.bearing.rate, rates.camera),
+        "bearing_correlated": correlated,
+        "bearing_correlation_time": time,
+        "bearing_counted": averaged_std(np.zeros(()), correlated, time, 1.0 / rates.camera),
         "axis": np.column_stack([first, np.cross(axis, first), axis]),
         "lasting": n.enabled and n.lasts,
         "odometry_scale": on * n.odometry_scale,
@@ -201,7 +211,7 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     _fill(model.judgement, device, {}, scenario.reward)
     of_vehicles: dict[str, tuple[list[Any], Callable[[int], dict[str, Any]]]] = {
         "dynamics": (limits, lambda i: _dynamics(limits[i], scenario, traffic[i])),
-        "camera": (cameras, lambda i: camera_entries(cameras[i], noises[i])),
+        "camera": (cameras, lambda i: camera_entries(cameras[i], noises[i], scenario.rates)),
         "noise": (noises, lambda i: noise_entries(noises[i], scenario.rates)),
         "fault": (faults, lambda i: fault_entries(faults[i], scenario)),
     }
@@ -282,12 +292,25 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "target_count": [len(targets) for targets in sets],
         "order": order,
         "rank": np.argsort(order),
+        "landmark_std": scenario.landmark_std or np.zeros(len(scenario.landmarks)),
         "clocks": any(f.clock_offset > 0.0 for f in faults),
         "restarts": any(f.restart.chance > 0.0 for f in faults),
         "alters": any(f.alters for f in faults),
-        "map_errors": any(f.map_error.chance > 0.0 for f in faults),
+        "map_errors": len(scenario.landmark_std) > 0 or any(f.map_error.chance > 0.0 for f in faults),
+        "past": _kept_ticks(scenario),
+        "correlated": any(n.enabled and n.bearing.correlated.std > 0.0 for n in scenario.noises),
         "jammers": any(f.jammer.chance > 0.0 for f in faults),
     }
+
+
+FARTHEST_DRAW = 5.0  # standard deviations, which one frame in two millions exceeds
+
+
+def _kept_ticks(scenario: Scenario) -> int:
+    """Return the number of ticks of which the poses of all agents are kept for frames that show the past."""
+    late = [camera for camera in scenario.cameras if camera.is_late]
+    ages = [c.latency + FARTHEST_DRAW * math.hypot(c.latency_error, c.latency_jitter) for c in late]
+    return 1 + math.ceil(max(ages) * scenario.rates.camera) if ages else 0
 
 
 def _start(scenario: Scenario) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import warp as wp
 
 from coopenv.estimation import Sight
 from coopenv.estimation.linalg import exp_so3
+from coopenv.world.dynamics import pose_before
 from coopenv.world.model import BLIND, IDEAL
 from coopenv.world.nearby import (
     agent_of,
@@ -27,8 +28,13 @@ from coopenv.world.nearby import (
 )
 from coopenv.world.random import (
     BEARING,
+    BEARING_DRIFT,
     BEARING_NOISE,
+    CAMERA_FRAME,
     CAMERA_RANGE,
+    EXTRINSICS,
+    MAP_ACCURACY,
+    four_gaussians,
     gaussian_pair,
     pair,
     random_words,
@@ -50,11 +56,24 @@ def marker_position(model: Any, state: Any, world: int, agent: int):
     return state.position[world, agent] + state.rotation[world, agent] * model.scene.marker[agent]
 
 
+@device_function
+def draw_map(model: Any, state: Any, world: int):
+    """Draw the errors of the landmarks' positions on all maps by the map's accuracy."""
+    for landmark in range(wp.where(model.map_errors == 1, model.landmarks, 0)):
+        words = random_words(state.seed[world], state.episode[world], 0, landmark, MAP_ACCURACY)
+        drawn, _ = four_gaussians(words, state.position[world, landmark])
+        state.map_offset[world, landmark] = model.landmark_std[landmark] * drawn
+
+
 @wp.func
 def mapped_position(model: Any, state: Any, world: int, vehicle: int, landmark: int):
-    """Return where a landmark's visible point is on a vehicle's map at the next tick, see the fault `map_error`."""
+    """Return where a landmark's visible point is on a vehicle's map at the next tick.
+
+    It is off by the map's accuracy and by the fault `map_error`.
+    """
     point = marker_position(model, state, world, landmark)
     if model.map_errors == 1:
+        point += state.map_offset[world, landmark]
         begun = state.map_tick[world, vehicle, landmark]
         if begun >= 0 and state.tick[world] + 1 >= begun:
             point += state.map_error[world, vehicle, landmark]
@@ -257,6 +276,26 @@ def noisy_bearing(noise: Any, level: Any, bearing: Any, words: Any):
 
 
 @device_function
+def drifting_bearing(model: Any, state: Any, world: int, vehicle: int, entry: int, target: int, tick: int, b: Any):
+    """Return a unit bearing with its correlated error, carried here from the exposure of the entry's last bearing.
+
+    The error is a vector whose part across the bearing counts: so it has no axes that could jump.
+    """
+    noise = model.noise[vehicle]
+    one = b.dtype(1.0)
+    words = random_words(state.seed[world], state.episode[world], tick, pair(vehicle, target), BEARING_DRIFT)
+    fresh, _ = four_gaussians(words, b)
+    before = state.bearing_tick[world, vehicle, entry]
+    keeps = one - one
+    if before >= 0:
+        keeps = wp.exp(-b.dtype(wp.float64(tick - before) * model.camera_period) / noise.bearing_correlation_time)
+    drift = keeps * state.bearing_drift[world, vehicle, entry] + wp.sqrt(one - keeps * keeps) * fresh
+    state.bearing_drift[world, vehicle, entry] = drift
+    level = noise.bearing_correlated * state.parameter[world, BEARING_NOISE]
+    return wp.normalize(b + level * (drift - wp.dot(drift, b) * b))
+
+
+@device_function
 def sight_of(model: Any, state: Any, world: int, vehicle: int, target: int, origin: Any, line: Any, ray: Any):
     """Return whether a neighbour is in view now, and if not, why; `ray` is `line` in the optical frame.
 
@@ -282,22 +321,44 @@ def sight_of(model: Any, state: Any, world: int, vehicle: int, target: int, orig
 
 
 @device_function
+def expose(model: Any, state: Any, world: int, vehicle: int, tick: int):
+    """Return the age of a vehicle's frame at a tick, s; carry the walk of its camera's mounting to that tick."""
+    camera = model.camera[vehicle]
+    words = random_words(state.seed[world], state.episode[world], tick, vehicle, CAMERA_FRAME)
+    turn, jitter = four_gaussians(words, camera.position)
+    if tick > 0:
+        step = camera.orientation_walk * wp.sqrt(type(jitter)(model.camera_period))
+        state.camera_turn[world, vehicle] += step * state.parameter[world, EXTRINSICS] * turn
+    state.bearing_age[world, vehicle] = camera.latency
+    return camera.latency + state.camera_delay[world, vehicle] + camera.latency_jitter * jitter
+
+
+@device_function
 def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
-    """Take one camera frame of one vehicle; the truth of this tick and the grid are already in place."""
+    """Take one camera frame of one vehicle; the truth of this tick and the grid are already in place.
+
+    A frame with an age shows where the camera and all targets were when it was exposed; what is present, and what
+    occludes a target, is that of this tick, and so is the angle of a panning camera, which is read with the exposure.
+    """
     keep_those_in_range(model, state, world, vehicle)
     agent = model.landmarks + vehicle
     camera = model.camera[vehicle]
     noise = model.noise[vehicle]
     level = noise.bearing * state.parameter[world, BEARING_NOISE]
-    R = state.rotation[world, agent]
     place = camera.position
     zero = place.dtype(0.0)
+    age = zero
+    exposed = tick
+    if camera.changes == 1:
+        age = expose(model, state, world, vehicle, tick)
+        exposed = wp.max(tick - camera.latency_ticks, 0)
+    R, position = pose_before(model, state, world, agent, tick, age)
     turned = camera_to_body(model, state, world, vehicle)
     to_rest = wp.transpose(camera.rotation) * turned
-    if camera.orientation_std > zero or camera.position_std > zero:
+    if camera.orientation_std > zero or camera.position_std > zero or camera.orientation_walk > zero:
         place = place + state.camera_shift[world, vehicle]
         turned = turned * exp_so3(state.camera_turn[world, vehicle])
-    origin = state.position[world, agent] + R * place
+    origin = position + R * place
     to_camera = wp.transpose(R * turned)
     if camera.focal_std > zero:  # the image is wider than a vehicle knows: as seen through the nominal lens
         wider = zero + place.dtype(1.0) + state.camera_focal[world, vehicle]
@@ -309,7 +370,8 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
         target = agent_of(state, kept, world, vehicle, entry)
         if kept > 0 and not is_target(model, vehicle, target):
             continue
-        line = marker_position(model, state, world, target) - origin
+        target_R, target_position = pose_before(model, state, world, target, tick, age)
+        line = target_position + target_R * model.scene.marker[target] - origin
         ray = to_camera * line
         sight = sight_of(model, state, world, vehicle, target, origin, line, ray)
         b = ray
@@ -321,11 +383,13 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
                 sight = MISSED
             if level > zero:
                 b = noisy_bearing(noise, level, b, words)
+        if sight == VISIBLE and noise.bearing_correlated > zero:
+            b = drifting_bearing(model, state, world, vehicle, entry, target, exposed, b)
         if sight == VISIBLE:
             if camera.pinhole == 1 and model.sensed == 1 and has_pixel(model, camera, ray):
                 b = through_pixels(camera, b)
             if state.pan[world, vehicle] != zero:
                 b = to_rest * b
             state.bearing[world, vehicle, entry] = b
-            state.bearing_tick[world, vehicle, entry] = tick
+            state.bearing_tick[world, vehicle, entry] = exposed
         state.sight[world, vehicle, entry] = sight

@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import orthonormalise
+from coopenv.estimation.linalg import orthonormalise, rigid_motion
 from coopenv.motions import prescribed
 from coopenv.motions.command import ACCELERATION, LATERAL, PAN, SPEED, command_of, gradually, sanitised
 from coopenv.motions.dispatch import displacement, drive_step
@@ -157,6 +157,39 @@ def move(model: Any, state: Any, world: int, vehicle: int, tick: int):
         command = command_in_force(model, state, world, vehicle, tick)
         drive_through(model, state, world, vehicle, command, tick)
         turn_camera(model, state, world, vehicle, command)
+
+
+@device_function
+def remember(model: Any, state: Any, world: int, tick: int):
+    """Keep the poses and twists of all agents at a tick, in worlds where some camera's frames have an age."""
+    for slot in range(model.past):
+        if tick == 0 or slot == tick % model.past:
+            for agent in range(model.agents):
+                state.past_rotation[world, agent, slot] = state.rotation[world, agent]
+                state.past_position[world, agent, slot] = state.position[world, agent]
+                state.past_velocity[world, agent, slot] = state.velocity[world, agent]
+                state.past_angular_velocity[world, agent, slot] = state.angular_velocity[world, agent]
+
+
+@device_function
+def pose_before(model: Any, state: Any, world: int, agent: int, tick: int, age: Any):
+    """Return the pose of an agent some time, s, before a tick.
+
+    It follows by the twist at the nearest tick that is kept: exactly while that is constant.
+    """
+    R = state.rotation[world, agent]
+    position = state.position[world, agent]
+    if age != type(age)(0.0):
+        back = wp.clamp(int(wp.round(age / type(age)(model.camera_period))), 0, wp.min(tick, model.past - 1))
+        slot = (tick - back) % model.past
+        R = state.past_rotation[world, agent, slot]
+        position = state.past_position[world, agent, slot]
+        since = age - type(age)(wp.float64(back) * model.camera_period)
+        v = state.past_velocity[world, agent, slot]
+        turn, way = rigid_motion(-since * state.past_angular_velocity[world, agent, slot], -since * v)
+        position = position + R * way
+        R = R * turn
+    return R, position
 
 
 @device_function

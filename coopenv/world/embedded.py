@@ -13,8 +13,8 @@ import warp as wp
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Coordinates
 from coopenv.estimation.validity import Rule
-from coopenv.world.camera import observe
-from coopenv.world.dynamics import move, move_landmarks
+from coopenv.world.camera import draw_map, observe
+from coopenv.world.dynamics import move, move_landmarks, remember
 from coopenv.world.model import Precision
 from coopenv.world.nearby import sort_into_cells
 from coopenv.world.odometry import draw_errors, measure_odometry
@@ -183,8 +183,10 @@ def sense_vehicle(model: Any, state: Any, world: int, vehicle: int, tick: int):
 
 @device_function
 def begin_sensing(model: Any, state: Any, world: int):
-    """Draw initial estimates and lasting errors, look for contact, take the first frame."""
+    """Draw errors of maps, initial estimates and lasting errors, look for contact, take the first frame."""
     sort_into_cells(model, state, world)
+    draw_map(model, state, world)
+    remember(model, state, world, 0)
     for vehicle in range(model.vehicles):
         set_initial_estimate(model, state, world, vehicle)
         draw_errors(model, state, world, vehicle)
@@ -214,6 +216,7 @@ def arrange_world(model: Any, state: Any, record: Any, world: int, tick: int):
     """Carry the landmarks to a tick, let vehicles appear, and sort everything into the grid."""
     move_landmarks(model, state, world, tick)
     appear(model, state, world, tick)
+    remember(model, state, world, tick)
     sort_into_cells(model, state, world)
 
 

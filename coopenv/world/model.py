@@ -239,6 +239,12 @@ def model_struct(p: Precision) -> Any:
         orientation_std: scalar  # rad, per axis, of the error of `rotation`
         position_std: scalar  # m, per axis, of the error of `position`
         focal_std: scalar  # of the error of `focal_length`, relative
+        orientation_walk: scalar  # rad per root of a second, of the error of `rotation`
+        latency: scalar  # s, known age of a frame
+        latency_std: scalar  # s, of a constant error of `latency`
+        latency_jitter: scalar  # s, of one drawn for every frame
+        latency_ticks: wp.int32  # nearest to `latency`
+        changes: wp.int32  # 1: frames have an age, or `rotation` walks
 
     @wp.struct
     class NoiseValues:
@@ -248,6 +254,9 @@ def model_struct(p: Precision) -> Any:
         angular_velocity: scalar  # rad/s
         bearing_paper: wp.int32
         bearing: scalar
+        bearing_correlated: scalar  # rad, standard deviation of a Gauss-Markov process
+        bearing_correlation_time: scalar  # s, of that
+        bearing_counted: scalar  # rad, standard deviation of white noise by which filters count that
         axis: mat33  # columns: image-plane axes and optical axis of the paper's formula, camera frame
         lasting: wp.int32  # 1: any of the errors below is on
         odometry_scale: scalar
@@ -410,11 +419,14 @@ def model_struct(p: Precision) -> Any:
         sensor: wp.array(dtype=SensorValues)  # (R,) beside cameras
         carries: wp.array2d(dtype=wp.int32)  # (N, R) 1: a vehicle has a sensor
         measures: wp.array2d(dtype=wp.int32)  # (R, A) 1: a sensor measures an agent
+        landmark_std: wp.array(dtype=scalar)  # (L,) m, accuracy of their places on the map
         fault: wp.array(dtype=FaultValues)  # (N,)
         clocks: wp.int32  # 1: some clock is off
         restarts: wp.int32  # 1: some vehicle may restart
         alters: wp.int32  # 1: some broadcast pose may differ from its sender's estimate
         map_errors: wp.int32  # 1: a landmark may be off on some map
+        past: wp.int32  # ticks of which poses are kept: as old as frames may be
+        correlated: wp.int32  # 1: some vehicle's bearings have a correlated error
         jammers: wp.int32  # 1: some vehicle may carry a jammer
         radio: Radio
         observer: ObserverValues

@@ -3,9 +3,9 @@
 A sample is held until the next one. The increment (dR, dp) over a tick is the exact composition of the held twists,
 so an observer predicts once per tick and loses nothing against predicting at every sample.
 
-Lasting errors (odometry scale, gyro bias, wheel slip, camera mounting, focal length) are truth, drawn once per vehicle
-and episode (`draw_errors`). Scale and bias walk, and slips come and go, from one camera tick to the next (`drift`).
-With all of them off, nothing is drawn and nothing is changed.
+Lasting errors (odometry scale, gyro bias, wheel slip, camera mounting, focal length, latency) are truth, drawn once per
+vehicle and episode (`draw_errors`). Scale and bias walk, and slips come and go, from one camera tick to the next
+(`drift`). With all of them off, nothing is drawn and nothing is changed.
 """
 
 from typing import Any
@@ -56,9 +56,10 @@ def draw_errors(model: Any, state: Any, world: int, vehicle: int):
     if camera.orientation_std > o[0] or camera.position_std > o[0]:
         turn, shift = six_gaussians(seed, episode, 0, vehicle, RESET_CAMERA, o)
     focal = o[0]
-    if camera.focal_std > o[0]:
+    delay = o[0]
+    if camera.focal_std > o[0] or camera.latency_std > o[0]:
         words = random_words(seed, episode, 0, vehicle, RESET_LENS)
-        focal, _ = gaussian_pair(words[0], words[1], o.dtype(1.0))
+        focal, delay = gaussian_pair(words[0], words[1], o.dtype(1.0))
     factor = state.parameter[world, EXTRINSICS]
     state.odometry_scale[world, vehicle] = noise.odometry_scale * state.parameter[world, ODOMETRY_SCALE] * scale[0]
     state.gyro_bias[world, vehicle] = wp.cw_mul(noise.gyro_bias, bias) * state.parameter[world, GYRO_BIAS]
@@ -67,6 +68,7 @@ def draw_errors(model: Any, state: Any, world: int, vehicle: int):
     state.camera_shift[world, vehicle] = camera.position_std * factor * shift
     least = o.dtype(SHORTEST)
     state.camera_focal[world, vehicle] = wp.max(camera.focal_std * factor * focal, least)
+    state.camera_delay[world, vehicle] = camera.latency_std * delay
 
 
 @device_function

@@ -45,6 +45,9 @@ LIE = wp.constant(wp.uint32(43))
 CORRUPTION = wp.constant(wp.uint32(44))
 MAP_ERROR = wp.constant(wp.uint32(46))
 JAMMER = wp.constant(wp.uint32(47))
+CAMERA_FRAME = wp.constant(wp.uint32(48))
+BEARING_DRIFT = wp.constant(wp.uint32(49))
+MAP_ACCURACY = wp.constant(wp.uint32(50))
 """For six numbers, the next stream gives the second half."""
 SENSOR = wp.constant(wp.uint32(64))
 STREAMS_PER_SENSOR = wp.constant(wp.uint32(16))
@@ -137,18 +140,25 @@ def gaussian_pair(word0: wp.uint32, word1: wp.uint32, one: Any):
 
 
 @wp.func
+def four_gaussians(words: vec4u, zero: Any):
+    """Return a vector of three independent standard normal numbers, in the type of `zero`, and a fourth number."""
+    one = zero.dtype(1.0)
+    x, y = gaussian_pair(words[0], words[1], one)
+    z, more = gaussian_pair(words[2], words[3], one)
+    return type(zero)(x, y, z), more
+
+
+@wp.func
 def six_gaussians(seed: wp.uint64, episode: wp.uint32, index: int, subject: int, stream: wp.uint32, zero: Any):
     """Return two vectors of three independent standard normal numbers each, in the type of `zero`.
 
     They are drawn from a stream and the next one.
     """
-    one = zero.dtype(1.0)
     a = random_words(seed, episode, index, subject, stream)
     b = random_words(seed, episode, index, subject, stream + wp.uint32(1))
-    x1, y1 = gaussian_pair(a[0], a[1], one)
-    z1, x2 = gaussian_pair(a[2], a[3], one)
-    y2, z2 = gaussian_pair(b[0], b[1], one)
-    return type(zero)(x1, y1, z1), type(zero)(x2, y2, z2)
+    first, x = four_gaussians(a, zero)
+    y, z = gaussian_pair(b[0], b[1], zero.dtype(1.0))
+    return first, type(zero)(x, y, z)
 
 
 @wp.func

@@ -1,11 +1,12 @@
 """The changing side of a world: one record of arrays with leading axes (world, agent or vehicle).
 
-W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders), M odometry samples a tick, S slots of
-the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q parameters, U numbers of an action, Z bodies
-of the traffic, G cells of the grid, I items in it. Measurements and messages have X entries, one per agent, and Y
-boxes, one per sender, or as many as are kept (V), see `coopenv.world.nearby`; E agents that may be off on maps. R
-sensors beside the camera; F measurements of a frame at most, in pairs of rows. L lanes of scratch: indexed by vehicle,
-shared by the vehicles that one thread takes in turn.
+W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders), K ticks of which poses are kept, M
+odometry samples a tick, S slots of the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q
+parameters, U numbers of an action, Z bodies of the traffic, G cells of the grid, I items in it. Measurements and
+messages have X entries, one per agent, and Y boxes, one per sender, or as many as are kept (V), see
+`coopenv.world.nearby`; E agents that may be off on maps, C entries with a correlated error. R sensors beside the
+camera; F measurements of a frame at most, in pairs of rows. L lanes of scratch: indexed by vehicle, shared by the
+vehicles that one thread takes in turn.
 
 A field of a record states its axes once, a letter each, and is allocated by them. It also states the rule of its saved
 values; all rules are checked before anything is restored.
@@ -313,6 +314,10 @@ def state_struct(p: Precision) -> Any:
         position: array("WA", vec3, TRUTH)  # truth, map
         velocity: array("WA", vec3, TRUTH)  # truth, body, m/s
         angular_velocity: array("WA", vec3, TRUTH)  # truth, body, rad/s
+        past_rotation: array("WAK", mat33, ROTATION._replace(of_truth=True))  # the same at a tick k, in slot k % K
+        past_position: array("WAK", vec3, TRUTH)
+        past_velocity: array("WAK", vec3, TRUTH)
+        past_angular_velocity: array("WAK", vec3, TRUTH)
         speed: array("WN", scalar)  # forwards, m/s
         turn: array("WN", scalar, TURN)  # steering angle, rad, or turn rate, rad/s, by the kind of motion
         lateral_speed: array("WN", scalar)  # to the left, m/s
@@ -336,6 +341,7 @@ def state_struct(p: Precision) -> Any:
         camera_turn: array("WN", vec3, TRUTH)  # rotation vector of the camera in its frame, beside the nominal one
         camera_shift: array("WN", vec3, TRUTH)  # truth: of the camera in the body frame, from the nominal position, m
         camera_focal: array("WN", scalar, TRUTH)  # truth: its focal length is (1 + this) times the nominal one
+        camera_delay: array("WN", scalar, TRUTH)  # truth: s by which its frames are older than the vehicle knows
 
         clock: array("WN", wp.int32, whole(-(10**8), 10**8))  # truth: ticks by which a vehicle's clock is ahead
         restart_tick: array("WN", wp.int32, whole(-1, 2**31 - 1))  # before which its observer restarts; -1: never
@@ -345,6 +351,7 @@ def state_struct(p: Precision) -> Any:
         jammer_tick: array("WN", wp.int32, whole(-1, 2**31 - 1))  # from which on its jammer is on; -1: never
         map_tick: array("WNE", wp.int32, whole(-1, 2**31 - 1))  # from which on its map is wrong there; -1: never
         map_error: array("WNE", vec3)  # of a landmark's place on its map, m
+        map_offset: array("WE", vec3)  # of a landmark's place on all maps from the start, m, by the map's accuracy
         broadcast_shift: array("WN", vec3)  # added to the position that it broadcasts at this tick, m, map
         broadcast_turn: array("WN", vec3)  # rotation vector by which the orientation that it broadcasts is turned
 
@@ -356,6 +363,8 @@ def state_struct(p: Precision) -> Any:
 
         bearing: array("WNX", vec3, DIRECTION)  # camera to target, camera frame without pan, last measured
         bearing_tick: array("WNX", wp.int32, TICK)  # tick of that bearing; -1: never
+        bearing_drift: array("WNC", vec3, TRUTH)  # truth: correlated error of that bearing, of standard deviation 1
+        bearing_age: array("WN", scalar)  # s since the last frame was exposed, as the vehicle knows it
         sight: array("WNX", wp.uint8, whole(min(Sight), max(Sight)))  # values of `Sight`
 
         reading: array("WNRX", vec6)  # last value of a sensor beside the camera; of the map: in the first entry
@@ -425,8 +434,9 @@ def state_sizes(model: Any, worlds: int) -> dict[str, int]:
         "Y": kept + 1 if kept else N,
         "E": 0 if kept and not model.map_errors else A,
     }
+    near["C"] = near["X"] * model.correlated
     grid = {"G": model.cells.across**2, "I": model.agents + model.traffic}
-    ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
+    ticks = {"K": model.past, "M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
     draws = {"P": model.routes.points, "Q": len(PARAMETERS), "Z": model.traffic, "U": model.action_size}
     sensors = 0 if model.sensor is None else model.sensor.shape[0]
     rows = {"R": sensors, "F": near["X"] * (1 + PAIRS_OF_ROWS * sensors)}

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+import warp as wp
 from numpy.testing import assert_allclose
 
-from coopenv.measurements.kinds import Kind, Placed, exponential
-from coopenv.measurements.sensor import kind_of
+from coopenv import CoopenvError
+from coopenv.measurements.in_warp import excess, plus_noise
+from coopenv.measurements.kinds import Kind, Placed, WarpFunctions, exponential
+from coopenv.measurements.sensor import kind_of, number_of
 from coopenv.measurements.table import KINDS
+from tests.helpers.doppler import derive_doppler, predict_doppler
 from tests.helpers.warp_calls import DTYPES, Calls
 
 OWN = "tests.helpers.doppler:DopplerInWarp"
@@ -91,3 +97,42 @@ def test_derivatives_in_warp_equal_the_kind_in_numpy(name: str, dtype: str) -> N
         tolerance = max(TOLERANCE[dtype], 1e-8) if name == OWN else TOLERANCE[dtype]  # by differences
         assert_allclose(found[:, : kind.rows], expected, atol=tolerance)
         assert not found[:, kind.rows :].any()
+
+
+@wp.func
+def approaching(R: Any, p: Any, v: Any, target_R: Any, target_p: Any, target_v: Any, empty: Any):
+    """Return the speed at which the distance shrinks, which is not what the class predicts."""
+    return -predict_doppler(R, p, v, target_R, target_p, target_v, empty)
+
+
+@wp.func
+def without_turns(R: Any, p: Any, v: Any, target_R: Any, target_p: Any, target_v: Any):
+    """Return derivatives that forget that a turn turns the velocity."""
+    own, target = derive_doppler(R, p, v, target_R, target_p, target_v)
+    for column in range(3):
+        own[0, column] = own.dtype(0.0)
+    return own, target
+
+
+@pytest.mark.parametrize(
+    ("functions", "problem"),
+    [
+        (WarpFunctions(approaching, plus_noise, excess, derive_doppler), r"predict: entry \[0\] is -?\d.*, in NumPy"),
+        (
+            WarpFunctions(predict_doppler, plus_noise, excess, without_turns),
+            r"jacobian: entry \[0, [012]\] is 0, in Num",
+        ),
+        (WarpFunctions(predict_doppler, plus_noise, excess, plus_noise), r"jacobian: TypeError: "),
+        (WarpFunctions(predict_doppler, excess, excess, derive_doppler), r"sample: entry \[0\] is"),
+    ],
+)
+def test_functions_in_warp_that_differ_from_the_class_are_named(functions: WarpFunctions, problem: str) -> None:
+    kind = kind_of("tests.helpers.doppler:Doppler")
+    kind.in_warp = functions
+    with pytest.raises(CoopenvError, match=rf"^sensor 'tests\.helpers\.doppler:Doppler': in_warp: {problem}"):
+        number_of("tests.helpers.doppler:Doppler", kind)
+
+
+def test_a_class_with_functions_in_warp_that_agree_is_used() -> None:
+    number = number_of(OWN, MADE[OWN])
+    assert number >= len(KINDS) and number == number_of(OWN, MADE[OWN])

@@ -15,11 +15,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 import coopenv
 from coopenv import CoopenvError
 from coopenv.bench.observers.changes import with_sensors
+from coopenv.cli.app import main
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao
 from coopenv.observers.recording import Recording
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
+from coopenv.sources.sources import open_recording
 from tests.helpers.commands import printed, refused
 from tests.helpers.sessions import ROOT, blocks
 
@@ -184,6 +186,27 @@ def test_a_run_whose_sensor_fails_keeps_what_it_has(tmp_path: Path, failure: str
     assert text.endswith(f" s before it are in {out})")
     with np.load(out / "trajectory.npz") as arrays:
         assert 0.4 < arrays["t"][-1] < 0.6
+
+
+def test_a_log_of_a_sensor_that_fails_has_the_ticks_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(FAILING.format(failure="raise OSError('no device')"), encoding="utf-8")
+    text = """title = "failing"
+horizon = 2.0
+rates = {camera = 20.0, odometry = 20.0, decision = 10.0}
+observer.name = "mekf"
+landmarks = [{name = "ahead", position = [5, 0, 1]}, {name = "left", position = [5, 4, 1]}]
+vehicles = [{motion = {kind = "constant", linear = [1, 0, 0]}, initial_pose.position = [0, 0, 0]}]
+sensors = [{kind = "mine.py:Failing"}]
+"""
+    Path("failing.toml").write_text(text, encoding="utf-8")
+    assert main(["record", "failing.toml", "--out", "failing.mcap"]) == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert re.search(r"predict: OSError: no device \(the 0\.\d+ s before it are in failing\.mcap\)$", line)
+    recorded = open_recording("failing.mcap")
+    assert 0.4 < recorded.t[-1] < 0.6 and recorded.visible.any()
 
 
 @pytest.mark.parametrize(

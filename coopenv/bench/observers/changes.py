@@ -28,6 +28,41 @@ DIRECTION = np.array([0.6, 0.8, 0.0])
 """Direction of a false position, map axes: horizontal, and along no road."""
 
 
+FAULT_MODELS = {
+    "offset": "is constant",
+    "ramp": "grows to its value at the end of the run",
+    "drift": "grows by its value every second",
+    "walk": "walks at random, by its value per square root of a second",
+    "intermittent": "comes and goes: it is there for `share` (0.2) of the time, in bursts of `burst` (0.5) s",
+}
+"""How an error goes on from its start, by name."""
+SHARE, BURST = 0.2, 0.5  # of an intermittent error, and s
+
+
+def amount(recording: Recording, fault: Fault, seed: int) -> np.ndarray:
+    """Return (K, N) how large the error of a fault is in each vehicle, by its model (default: a constant one)."""
+    since = recording.t - fault.start_in(float(recording.t[-1]))
+    begun, shape = since > -1e-6 * recording.dt, (recording.ticks, len(recording.setups))
+    passed = np.broadcast_to(np.maximum(0.0, since)[:, None], shape)
+    if fault.word == "walk":
+        steps = np.random.default_rng([seed, 10]).standard_normal(shape) * math.sqrt(recording.dt)
+        course = np.cumsum(steps * (since > 0.5 * recording.dt)[:, None], axis=0)
+    elif fault.word == "intermittent":
+        course = np.where(bursts(recording, fault, seed, shape[1:]), 1.0, 0.0)
+    else:
+        lengths = {"drift": 1.0, "ramp": max(float(since[-1]), recording.dt)}
+        course = passed / lengths[fault.word] if fault.word in lengths else np.ones(shape)
+    return np.asarray(fault.value * course * np.outer(begun, _on(recording, fault)))
+
+
+def bursts(recording: Recording, fault: Fault, seed: int, of: Sequence[int], share: float | None = None) -> np.ndarray:
+    """Return (K, ...) whether an error that comes and goes is there, drawn anew for every burst of each of several."""
+    length = max(1, round(fault.options.get("burst", BURST) / recording.dt))
+    drawn = np.random.default_rng([seed, 4]).random((math.ceil(recording.ticks / length), *of))
+    there = drawn < (fault.options.get("share", SHARE) if share is None else share)
+    return np.repeat(there, length, axis=0)[: recording.ticks]
+
+
 def with_sensors(recording: Recording, names: Iterable[str]) -> Recording:
     """Keep the measurements of some sensors alone, by their names; the camera's is "camera"."""
     kept, scenario = set(names), recording.scenario
@@ -97,41 +132,101 @@ def with_random_bearings(recording: Recording, fault: Fault, seed: int) -> Recor
     return replace(recording, bearings=bearings)
 
 
-def with_gyro_step(recording: Recording, fault: Fault, seed: int) -> Recording:
-    """Add a bias, rad/s, to the vertical axis of gyros from a time on."""
+def with_reflections(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Mirror the bearings to landmarks at a vertical plane along the vehicle's way, in bursts for a share of the time.
+
+    Bursts are drawn per vehicle and landmark.
+    """
+    N, L = len(recording.setups), recording.landmarks.shape[1]
+    reflected = bursts(recording, fault, seed, (N, L), fault.value) & _on(recording, fault)[:, None]
+    way = recording.velocity.mean(axis=0)
+    size = np.linalg.norm(way[:, :2], axis=-1, keepdims=True)
+    ahead = np.where(size > 1e-6, way[:, :2] / np.maximum(size, 1e-6), (1.0, 0.0))
+    across = np.stack([-ahead[:, 1], ahead[:, 0], np.zeros(N)], axis=-1)[:, None]  # of the plane, body axes
+    bearings = recording.bearings.copy()
+    seen = bearings[:, :, :L]
+    mirrored = seen - 2.0 * np.sum(seen * across, axis=-1, keepdims=True) * across
+    bearings[:, :, :L] = np.where(reflected[..., None], mirrored, seen)
+    return replace(recording, bearings=bearings)
+
+
+def with_late_frames(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Let frames show the bearings of a time before, interpolated between frames; what has none is not measured."""
+    frames = np.arange(recording.ticks) - fault.value / recording.dt
+    first = np.maximum(np.floor(frames + 1e-9).astype(int), 0)
+    share = np.maximum(frames - first, 0.0)[:, None, None, None]
+    then, after = (recording.bearings[k] for k in (first, np.minimum(first + 1, recording.ticks - 1)))
+    between = np.where(share > 1e-9, (1.0 - share) * then + share * after, then)
+    between /= np.linalg.norm(between, axis=-1, keepdims=True)
+    bearings = np.where(_on(recording, fault)[:, None, None], between, recording.bearings)
+    seen = recording.visible & np.isfinite(bearings).all(axis=-1)
+    return replace(recording, visible=seen, bearings=np.where(seen[..., None], bearings, np.nan))
+
+
+def with_correlated_bearings(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Add a Gauss-Markov error of first order to bearings, drawn per vehicle and target."""
+    generator, time = np.random.default_rng([seed, 5]), fault.options.get("time", 1.0)
+    kept = math.exp(-recording.dt / time) if time > 0.0 else 0.0
+    error = np.zeros(recording.bearings.shape[1:])
+    bearings = recording.bearings.copy()
+    for k in range(recording.ticks):
+        fresh = fault.value * generator.standard_normal(error.shape)
+        error = fresh if k == 0 else kept * error + math.sqrt(1.0 - kept**2) * fresh
+        bearings[k] += error * _on(recording, fault)[:, None, None]
+    bearings /= np.linalg.norm(bearings, axis=-1, keepdims=True)
+    return replace(recording, bearings=bearings)
+
+
+def with_gyro_error(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Add a bias, rad/s, to the vertical axis of gyros."""
     from coopenv.estimation.poses import about_z  # late: `coopenv list variants` imports this module, and no Numba
 
-    bias = fault.value * np.outer(np.arange(recording.ticks) >= _first_tick(recording, fault), _on(recording, fault))
+    bias = amount(recording, fault, seed)
     angular_velocity = recording.angular_velocity + bias[..., None] * (0.0, 0.0, 1.0)
     rotation = recording.rotation @ about_z(bias * recording.dt)
     return replace(recording, rotation=rotation, angular_velocity=angular_velocity)
 
 
-def with_camera_step(recording: Recording, fault: Fault, seed: int) -> Recording:
-    """Turn cameras on their mountings to the left by an angle, rad, from a time on."""
+def with_camera_error(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Turn cameras on their mountings to the left by an angle, rad."""
     from coopenv.estimation.poses import about_z  # late, as above
 
-    bearings, turn = recording.bearings.copy(), about_z(np.array(fault.value))
-    bearings[_first_tick(recording, fault) :, _on(recording, fault)] @= turn
+    turn = amount(recording, fault, seed)
+    bearings = np.where(turn[..., None, None] == 0.0, recording.bearings, recording.bearings @ about_z(turn))
     return replace(recording, bearings=bearings)
 
 
 def with_focal_error(recording: Recording, fault: Fault, seed: int) -> Recording:
-    """Let focal lengths be larger than observers know by a share, from a time on."""
-    bearings, first, on = recording.bearings.copy(), _first_tick(recording, fault), _on(recording, fault)
-    axes = np.array([setup.optical_axis for setup in recording.setups])[on, None]
-    along = np.einsum("knti,nui->knt", bearings[first:, on], axes)[..., None] * axes
-    wider = along + (1.0 + fault.value) * (bearings[first:, on] - along)
-    bearings[first:, on] = wider / np.linalg.norm(wider, axis=-1, keepdims=True)
+    """Let focal lengths be larger than observers know by a share."""
+    share = amount(recording, fault, seed)[..., None, None]
+    axes = np.array([setup.optical_axis for setup in recording.setups])[:, None]
+    along = np.einsum("knti,nui->knt", recording.bearings, axes)[..., None] * axes
+    wider = along + (1.0 + share) * (recording.bearings - along)
+    bearings = np.where(share == 0.0, recording.bearings, wider / np.linalg.norm(wider, axis=-1, keepdims=True))
     return replace(recording, bearings=bearings)
+
+
+def with_scale_error(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Let odometries read too much by a share."""
+    scale = 1.0 + amount(recording, fault, seed)[..., None]
+    return replace(recording, translation=recording.translation * scale, velocity=recording.velocity * scale)
 
 
 def with_scale_drift(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Let the scale error of odometries grow linearly from a time on, up to its value at the end."""
-    start, end = fault.start_in(float(recording.t[-1])), float(recording.t[-1])
-    grown = np.maximum(0.0, recording.t - start) / max(end - start, recording.dt)
-    scale = (1.0 + fault.value * np.outer(grown, _on(recording, fault)))[..., None]
-    return replace(recording, translation=recording.translation * scale, velocity=recording.velocity * scale)
+    return with_scale_error(recording, replace(fault, word="ramp"), seed)
+
+
+def with_landmark_error(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Shift one landmark on all maps, drawn or by its number, horizontally by a distance, m."""
+    count, generator = recording.landmarks.shape[1], np.random.default_rng([seed, 9])
+    mark, angle = generator.integers(count), 2.0 * math.pi * generator.random()
+    if (number := int(fault.options.get("landmark", mark + 1))) > count:
+        raise CoopenvError(f"fault {fault.text}: landmark: expected a number up to {count}, got {number}")
+    landmarks = recording.landmarks.copy()
+    shift = amount(recording, fault, seed)[:, :1] * _horizontal(np.array(fault.options.get("angle", angle)))
+    landmarks[:, number - 1] += shift
+    return replace(recording, landmarks=landmarks)
 
 
 def without_landmarks(recording: Recording, fault: Fault, seed: int) -> Recording:
@@ -185,6 +280,28 @@ def with_map_error(recording: Recording, fault: Fault, seed: int) -> Recording:
     false.map_error[entries] = offset[:, None] * _horizontal(np.broadcast_to(angle, len(marks)))
     false.map_tick[entries] = _first_tick(recording, fault)
     return replace(recording, interference=false)
+
+
+def with_map_noise(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Shift every landmark on all maps by a normally distributed error in each axis."""
+    shape = recording.landmarks.shape[1:]
+    error = fault.value * np.random.default_rng([seed, 7]).standard_normal(shape)
+    return replace(recording, landmarks=recording.landmarks + error)
+
+
+def with_map_exchange(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Exchange the places of two landmarks on all maps, drawn.
+
+    Raises:
+        CoopenvError: there is one landmark or none.
+    """
+    count = recording.landmarks.shape[1]
+    if count < 2:
+        raise CoopenvError(f"fault {fault.text}: needs two landmarks, there {'is one' if count else 'are none'}")
+    pair = np.random.default_rng([seed, 8]).choice(count, 2, replace=False)
+    landmarks = recording.landmarks.copy()
+    landmarks[:, pair] = landmarks[:, pair[::-1]]
+    return replace(recording, landmarks=landmarks)
 
 
 def _horizontal(angle: np.ndarray) -> np.ndarray:

@@ -12,28 +12,37 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from coopenv.base.errors import CoopenvError, listed, shown, suggest
-from coopenv.base.fault_text import Fault, FaultError, FaultKind, parse_fault
+from coopenv.base.fault_text import Bounds, Fault, FaultError, FaultKind, parse_fault
 from coopenv.base.sections import LARGEST
 from coopenv.bench.observers.changes import (
+    FAULT_MODELS,
     NO_FOLLOWERS,
     leaders_of,
     usual_sender,
-    with_camera_step,
+    with_camera_error,
+    with_correlated_bearings,
     with_delay,
     with_focal_error,
-    with_gyro_step,
+    with_gyro_error,
     with_jammer,
+    with_landmark_error,
+    with_late_frames,
     with_lie,
     with_loss,
     with_map_error,
+    with_map_exchange,
+    with_map_noise,
     with_prior_error,
     with_random_bearings,
+    with_reflections,
     with_scale_drift,
+    with_scale_error,
     with_sensors,
     with_wrong_association,
     without_landmarks,
 )
 from coopenv.scenario import Scenario, load_scenario
+from coopenv.scenario.bodies import MOST_LANDMARKS
 from coopenv.scenario.sensing import LONGEST_REPLAY
 from coopenv.sources.registry import kinds
 
@@ -45,11 +54,18 @@ SIZE, ANY = (0.0, LARGEST), (-LARGEST, LARGEST)
 """Bounds of options."""
 
 
+Change = Callable[["Recording", Fault, int], "Recording"]
+
+
+def _unchanged(recording: Recording, fault: Fault, seed: int) -> Recording:
+    return recording
+
+
 @dataclass(frozen=True)
 class RecordFault(FaultKind):
     """A fault that changes a recording, logs included: (recording, fault, seed) -> recording."""
 
-    change: Callable[[Recording, Fault, int], Recording] = lambda recording, fault, seed: recording
+    change: Change = _unchanged
 
 
 @dataclass(frozen=True)
@@ -65,6 +81,27 @@ class WorldFault(FaultKind):
     """Apply the fault by default to the usual sender alone; otherwise to all vehicles."""
 
 
+OF_BURSTS: dict[str, Bounds] = {"share": (0.0, 1.0), "burst": (1e-3, LARGEST)}
+LOWEST = {"relative": -1.0}
+"""Least values, by unit."""
+
+
+def _undeclared(value: str, meaning: str, unit: str, default: float, change: Change) -> RecordFault:
+    """Return an error that observers do not know of, from its start on."""
+    about = f"{meaning} from START on, {unit}; undeclared"
+    return RecordFault(value, about, default, LOWEST.get(unit, -LARGEST), start=True, vehicles=True, change=change)
+
+
+def _of_model(value: str, meaning: str, unit: str, default: float, change: Change) -> RecordFault:
+    """Return the same, of an error that goes on by one of `FAULT_MODELS`."""
+    return replace(
+        _undeclared(f"MODEL[:{value}]", meaning, unit, default, change),
+        words=dict.fromkeys(FAULT_MODELS, default),
+        options=OF_BURSTS,
+        unused={model: tuple(OF_BURSTS) for model in FAULT_MODELS if model != "intermittent"},
+    )
+
+
 FAULTS: dict[str, RecordFault | WorldFault] = {
     "v2x_loss": RecordFault("SHARE", "of the messages that is lost", 0.3, high=1.0, change=with_loss),
     "v2x_delay": RecordFault("SECONDS", "by which messages arrive later", 0.2, change=with_delay),
@@ -78,42 +115,46 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
     "random_bearings": RecordFault(
         "SHARE", "of the bearings that points in a uniform direction", 0.1, high=1.0, change=with_random_bearings
     ),
-    "gyro_step": RecordFault(
-        "RATE",
-        "by which gyros are biased about the vertical from START on, rad/s; undeclared",
-        0.02,
-        low=-LARGEST,
-        start=True,
-        vehicles=True,
-        change=with_gyro_step,
-    ),
-    "camera_step": RecordFault(
-        "ANGLE",
-        "by which cameras are turned to the left on their mountings from START on, rad; undeclared",
-        0.05,
-        low=-math.pi,
-        high=math.pi,
-        start=True,
-        vehicles=True,
-        change=with_camera_step,
-    ),
-    "focal_step": RecordFault(
+    "reflections": RecordFault(
         "SHARE",
-        "by which focal lengths are too large from START on; undeclared",
-        0.05,
-        low=-0.9,
-        start=True,
+        "of the time in which a landmark is seen in a mirror, in bursts of 0.5 s",
+        0.2,
+        high=1.0,
+        options={"burst": (1e-3, LARGEST)},
         vehicles=True,
-        change=with_focal_error,
+        change=with_reflections,
     ),
-    "scale_drift": RecordFault(
-        "SHARE",
-        "to which the scale error of odometries grows from START to the end; undeclared",
-        0.1,
-        low=-1.0,
-        start=True,
+    "late_frames": RecordFault(
+        "SECONDS",
+        "by which camera frames are older than stated; undeclared",
+        0.03,
         vehicles=True,
-        change=with_scale_drift,
+        change=with_late_frames,
+    ),
+    "correlated_bearings": RecordFault(
+        "STD",
+        "of an error of bearings that lasts for a time, 1 s, rad; undeclared",
+        0.003,
+        options={"time": SIZE},
+        vehicles=True,
+        change=with_correlated_bearings,
+    ),
+    "gyro_step": _undeclared("RATE", "by which gyros are biased about the vertical", "rad/s", 0.02, with_gyro_error),
+    "gyro": _of_model("RATE", "gyros have a bias about the vertical", "rad/s", 0.02, with_gyro_error),
+    "camera_step": _undeclared(
+        "ANGLE", "by which cameras are turned to the left on their mountings", "rad", 0.05, with_camera_error
+    ),
+    "camera": _of_model("ANGLE", "cameras are turned to the left on their mountings", "rad", 0.05, with_camera_error),
+    "focal_step": _undeclared("SHARE", "by which focal lengths are too large", "relative", 0.05, with_focal_error),
+    "focal": _of_model("SHARE", "focal lengths are too large", "relative", 0.05, with_focal_error),
+    "scale_drift": _undeclared(
+        "SHARE", "to which the scale error of odometries grows up to the end", "relative", 0.1, with_scale_drift
+    ),
+    "scale": _of_model("SHARE", "odometries read too much", "relative", 0.005, with_scale_error),
+    "landmark": replace(
+        _of_model("METRES", "a landmark, drawn or by its number, is off on all maps", "m", 1.0, with_landmark_error),
+        options={"landmark": range(1, MOST_LANDMARKS + 1), "angle": ANY, **OF_BURSTS},
+        vehicles=False,
     ),
     "landmarks_lost": RecordFault(
         "", "no landmark is visible", 0.0, start=True, duration=True, change=without_landmarks
@@ -128,6 +169,10 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         vehicles=True,
         change=with_map_error,
     ),
+    "map_noise": RecordFault(
+        "STD", "of the error of all landmarks on all maps, per axis, m; undeclared", 0.05, change=with_map_noise
+    ),
+    "map_exchange": RecordFault("", "two landmarks are exchanged on all maps", 0.0, change=with_map_exchange),
     "prior_error": RecordFault(
         "METRES",
         "by which initial estimates are off on the map; undeclared",
@@ -273,7 +318,8 @@ def variant_rows() -> list[dict[str, str]]:
     named = {name: variant.summary for name, variant in VARIANTS.items()}
     faults = {f"{name}={kind.value}" if kind.value else name: kind.meaning for name, kind in FAULTS.items()}
     robots = {name: about for kind in kinds().values() for name, about in kind.variants.items()}
-    tables = {"environments, logs": named, "recorded robots": robots, "--fault": faults}
+    models = {f"MODEL {name}": f"the error {about}" for name, about in FAULT_MODELS.items()}
+    tables = {"environments, logs": named, "recorded robots": robots, "--fault": faults | models}
     return [{"name": n, "of": of, "about": text} for of, variants in tables.items() for n, text in variants.items()]
 
 
@@ -312,7 +358,10 @@ def with_world(variant: FaultVariant, scenario: Scenario) -> FaultVariant:
 
 def check_names(fault: Fault, vehicles: Sequence[str], landmarks: Sequence[str]) -> None:
     """Refuse unknown vehicles and landmarks. Raises CoopenvError: it names the known ones."""
-    given = {"vehicle": (fault.vehicles, vehicles), "landmark": ([fault.word] * (fault.name == "map_error"), landmarks)}
+    given = {
+        "vehicle": (fault.vehicles, vehicles),
+        "landmark": ([fault.word] * FAULTS[fault.name].free_word, landmarks),
+    }
     for kind, (names, known) in given.items():
         for name in names:
             if name and name not in known:

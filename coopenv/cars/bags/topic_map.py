@@ -54,7 +54,8 @@ class Topics(Section):
 
     detections: TopicName | None = None
     """pixy_camera/ObjectInfoArrayStamped: blocks in pixels; sensor_msgs/Image or CompressedImage: frames with tags;
-    apriltag_msgs/AprilTagDetectionArray, vision_msgs/Detection2DArray, aruco_msgs/MarkerArray, or the authors'
+    apriltag_msgs or apriltag_ros/AprilTagDetectionArray, vision_msgs/Detection2DArray, aruco_msgs/MarkerArray,
+    fiducial_msgs/FiducialArray or FiducialTransformArray, ar_track_alvar_msgs/AlvarMarkers, or the authors'
     ArucoArray."""
     bearings: TopicName | None = None
     """pixy_camera/ObjectBearingArrayStamped: unit vectors from the target to the camera, optical frame."""

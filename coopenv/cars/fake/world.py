@@ -75,6 +75,7 @@ class CarWorld(World):
         model = super()._build_model()
         camera = model.camera.numpy()  # on the CPU this and the others are views
         camera["quantise"], camera["undistort"] = 0, 1
+        camera["changes"] = 0  # frames are stamped when they are exposed
         if self._frames:
             camera["miss_probability"], model.noise.numpy()["bearing"] = 0.0, 0.0
         targets = np.tile(np.arange(model.agents), (model.vehicles, 1))

@@ -166,17 +166,51 @@ def _centred(found: list[tuple[int, float, float, float]], camera: Calibration) 
     return [Tag(int(n), size, ray if known else None, v if known else None) for (n, size, _, v), ray, known in rows]
 
 
-def _markers(message: Any, _settings: VisionSettings, _: Calibration) -> list[Tag]:
-    """Return the detections of the authors' ArucoArray, or a MarkerArray: positions in the camera's optical frame."""
+LISTS = ("arucos", "markers", "transforms", "detections")
+"""Names of what a detector of poses has found, by the type of its message."""
+
+
+def _poses(message: Any, _settings: VisionSettings, _: Calibration) -> list[Tag]:
+    """Return the markers of a message that has their positions in the camera's optical frame; bundles have no number.
+
+    Read are the authors' ArucoArray, aruco_msgs, apriltag_ros, fiducial_msgs and ar_track_alvar_msgs.
+    """
     found = []
-    entries: Any = message.arucos if hasattr(message, "arucos") else message.markers
+    entries: Any = next(getattr(message, name) for name in LISTS if hasattr(message, name))
     for entry in entries:
         marker = getattr(entry, "marker", entry)
-        position = marker.pose.pose.position
-        place = np.array([position.x, position.y, position.z], dtype=np.float64)
-        far = float(np.linalg.norm(place))
-        found.append(Tag(int(marker.id), -far, place / far if 0.0 < far < np.inf else None))
+        numbers = np.atleast_1d(getattr(marker, "fiducial_id", getattr(marker, "id", ())))
+        if len(numbers) == 1:
+            place = _place_of(marker)
+            far = float(np.linalg.norm(place))
+            found.append(Tag(int(numbers[0]), -far, place / far if 0.0 < far < np.inf else None))
     return found
+
+
+def _place_of(marker: Any) -> Array:
+    """Return the position (3,) of a marker, m: that of a transform, or of a pose with a stamp, a covariance or not."""
+    while hasattr(marker, "pose"):
+        marker = marker.pose
+    place = marker.position if hasattr(marker, "position") else marker.transform.translation
+    return np.array([place.x, place.y, place.z], dtype=np.float64)
+
+
+def _corners(message: Any, _settings: VisionSettings, camera: Calibration) -> list[Tag]:
+    """Return the markers of a FiducialArray, which has the pixels of corners: the ray is where diagonals intersect."""
+    pixels = np.array(
+        [[(getattr(f, f"x{n}"), getattr(f, f"y{n}")) for n in range(4)] for f in message.fiducials], np.float64
+    ).reshape(-1, 4, 2)
+    with np.errstate(all="ignore"):  # values that are not finite give no ray
+        corners, there = rays(pixels.reshape(-1, 2), camera)
+        c = corners.reshape(-1, 4, 3)
+        centre = np.cross(np.cross(c[:, 0], c[:, 2]), np.cross(c[:, 1], c[:, 3]))
+        centre /= (
+            np.linalg.norm(centre, axis=-1, keepdims=True) * np.sign((centre * c.sum(axis=1)).sum(axis=-1))[:, None]
+        )
+    whole = np.asarray(there.reshape(-1, 4).all(axis=-1) & np.isfinite(centre).all(axis=-1))
+    areas = np.ptp(pixels, axis=1).prod(axis=-1)
+    rows = zip(message.fiducials, areas, centre, pixels[..., 1].mean(axis=-1), whole, strict=True)
+    return [Tag(int(f.fiducial_id), area, ray if ok else None, row if ok else None) for f, area, ray, row, ok in rows]
 
 
 BEARINGS = "pixy_camera/msg/ObjectBearingArrayStamped"
@@ -186,9 +220,20 @@ FINDERS: dict[str, Find] = {
     **dict.fromkeys(IMAGES, _frame),
     "apriltag_msgs/msg/AprilTagDetectionArray": _apriltags,
     "vision_msgs/msg/Detection2DArray": _boxes,
-    "aruco_msgs/msg/MarkerArray": _markers,
-    "svea_thesis/msg/ArucoArray": _markers,
-    "svea_msgs/msg/ArucoArray": _markers,
+    "fiducial_msgs/msg/FiducialArray": _corners,
+    **dict.fromkeys(
+        (
+            "aruco_msgs/msg/MarkerArray",
+            "apriltag_ros/msg/AprilTagDetectionArray",
+            "apriltags_ros/msg/AprilTagDetectionArray",
+            "apriltags2_ros/msg/AprilTagDetectionArray",
+            "ar_track_alvar_msgs/msg/AlvarMarkers",
+            "fiducial_msgs/msg/FiducialTransformArray",
+            "svea_thesis/msg/ArucoArray",
+            "svea_msgs/msg/ArucoArray",
+        ),
+        _poses,
+    ),
 }
 """Decoders by the type of the message."""
 

@@ -44,7 +44,10 @@ SEARCH, RESECTION, TRACKING = 0, 1, 2  # purpose of a frame
 
 @device_function
 def bearing_variance(model: Any, i: int):
-    """Return the variance of a bearing of vehicle i per tangent axis, with that of pixels which are rounded."""
+    """Return the variance of a bearing of vehicle i per tangent axis, with that of pixels which are rounded.
+
+    A correlated error counts as white noise.
+    """
     std = wp.float64(model.noise[i].bearing)
     variance = std * std
     if model.noise[i].bearing_paper == 1:
@@ -52,6 +55,8 @@ def bearing_variance(model: Any, i: int):
     if model.camera[i].quantise == 1:
         focal = wp.float64(wp.min(model.camera[i].focal_length))
         variance += wp.float64(ROUNDING_VARIANCE) / (focal * focal)
+    correlated = wp.float64(model.noise[i].bearing_counted)
+    variance += correlated * correlated
     return wp.max(variance, wp.float64(MIN_BEARING_STD) * wp.float64(MIN_BEARING_STD))
 
 

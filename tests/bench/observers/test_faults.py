@@ -121,7 +121,9 @@ def test_the_recorded_world_has_the_fault() -> None:
         ("lie=jump,honest_odometry=2", "honest_odometry: expected a whole number from 0 to 1, got '2'"),
         ("lie=replay:1@1,turn=1", "lie: no option 'turn'; allowed: std, honest_odometry"),
         ("lie=jump,std=1,std=2", "'std=2' is not OPTION=VALUE, each option once"),
-        ("nosuch=1", "known: v2x_loss, .*focal_length, clock, restart, .*21 in all"),
+        ("gyro=offset:1,share=1", "gyro: no option 'share'; allowed: none"),
+        ("gyro=sometimes:1", "unknown gyro 'sometimes'.*offset, ramp, drift, walk, intermittent"),
+        ("nosuch=1", "known: v2x_loss, .*gyro_step, .*31 in all"),
         ("restart@101%", "restart: start: expected a number from 0 to 100, got '101'"),
     ],
 )
@@ -306,6 +308,101 @@ def test_the_scale_error_grows_to_its_value() -> None:
         )
         assert_allclose(getattr(after, name), expected)
     assert differing(after, made()) == {"velocity", "translation"}
+
+
+def test_a_constant_scale_error_begins_at_its_time() -> None:
+    after, late = changed_by("vehicle_1:scale=offset:0.02@2"), made().t >= 2.0 - 1e-9
+    for name in ("velocity", "translation"):
+        expected = getattr(made(), name).copy()
+        expected[late, 0] *= 1.02
+        assert_allclose(getattr(after, name), expected)
+    assert differing(after, made()) == {"velocity", "translation"}
+
+
+def test_cameras_turn_slowly() -> None:
+    after = changed_by("vehicle_2:camera=drift:0.1@2")
+    turned = Rotation.from_euler("z", -0.1 * 2.0).apply(made().bearings[240, 1].copy())  # 4 s after the start
+    assert_allclose(after.bearings[240, 1], turned, atol=1e-9)
+    assert_array_equal(after.bearings[:120], made().bearings[:120])
+    assert_array_equal(np.delete(after.bearings, 1, axis=1), np.delete(made().bearings, 1, axis=1))
+
+
+def test_late_frames_show_the_world_as_it_was() -> None:
+    """A delay by whole frames shifts bearings; half a frame lies between two; the first frames are not measured."""
+    after, halved = changed_by("vehicle_1:late_frames=0.05"), changed_by(f"late_frames={made().dt / 2:.17g}")
+    assert_allclose(after.bearings[3:, 0], made().bearings[:-3, 0], atol=1e-9)
+    assert_array_equal(np.delete(after.bearings, 0, axis=1), np.delete(made().bearings, 0, axis=1))
+    mean = made().bearings[:-1] + made().bearings[1:]
+    assert_allclose(halved.bearings[1:], mean / np.linalg.norm(mean, axis=-1, keepdims=True), atol=1e-9)
+    assert_allclose(changed_by("late_frames=0").bearings, made().bearings, atol=1e-12)
+    assert_array_equal(after.visible, made().visible & np.isfinite(after.bearings).all(axis=-1))
+
+
+def test_reflections_come_in_bursts_to_landmarks_alone() -> None:
+    """A mirrored bearing keeps its height and its part along the vehicle's way."""
+    after, L = changed_by("reflections=0.3,burst=0.25", 1), made().landmarks.shape[1]
+    wrong = (after.bearings != made().bearings).any(axis=-1) & made().visible
+    assert not wrong[:, :, L:].any() and 0.1 < wrong[:, :, :L].sum() / made().visible[:, :, :L].sum() < 0.5
+    starts = np.flatnonzero(np.diff(wrong[:, 0, 0].astype(int), prepend=0) != 0)
+    assert len(starts) > 2 and (starts % 15 == 0).all()  # a landmark in view of the first vehicle throughout
+    before, now = made().bearings[wrong], after.bearings[wrong]
+    vehicle = np.nonzero(wrong)[1]
+    way = made().velocity.mean(axis=0)[vehicle, :2]
+    assert_allclose(now[:, 2], before[:, 2])
+    assert_allclose(np.sum(now[:, :2] * way, axis=-1), np.sum(before[:, :2] * way, axis=-1), atol=1e-9)
+    assert_allclose(now[:, 0] * way[:, 1] - now[:, 1] * way[:, 0], before[:, 1] * way[:, 0] - before[:, 0] * way[:, 1])
+
+
+def test_correlated_errors_of_bearings_last_for_their_time() -> None:
+    after = changed_by("correlated_bearings=0.01,time=0.5", 2)
+    error = (after.bearings - made().bearings).reshape(made().ticks, -1)
+    error = error[:, np.isfinite(error).all(axis=0)]
+    assert_allclose(np.linalg.norm(after.bearings[made().visible], axis=-1), 1.0)
+    tangent = 2.0 / 3.0  # of the variance of three axes stays in a unit vector
+    assert_allclose(error.std(), 0.01 * np.sqrt(tangent), rtol=0.3)
+    correlation = np.mean(error[6:] * error[:-6]) / np.mean(error**2)
+    assert_allclose(correlation, np.exp(-0.1 / 0.5), atol=0.1)
+
+
+def test_maps_are_wrong_everywhere() -> None:
+    noise = changed_by("map_noise=0.5", 3).landmarks - made().landmarks
+    assert_allclose(noise, np.broadcast_to(noise[0], noise.shape), atol=1e-12)
+    assert 0.2 < noise[0].std() < 0.9 and np.unique(noise[0].round(9)).size == noise[0].size
+    exchanged = changed_by("map_exchange", 1).landmarks
+    moved = np.flatnonzero((exchanged != made().landmarks).any(axis=(0, 2)))
+    assert len(moved) == 2
+    assert_array_equal(exchanged[:, moved], made().landmarks[:, moved[::-1]])
+
+
+def test_a_landmark_moves_on_maps_alone() -> None:
+    shift = changed_by("landmark=drift:0.5@1,landmark=2,angle=0").landmarks - made().landmarks
+    expected = np.zeros_like(shift)
+    expected[:, 1, 0] = 0.5 * np.maximum(0.0, made().t - 1.0)
+    assert_allclose(shift, expected, atol=1e-12)
+    drawn = changed_by("landmark=offset:0.5", 4).landmarks - made().landmarks
+    assert_allclose(np.sort(np.linalg.norm(drawn, axis=-1), axis=1)[:, -2:], [[0.0, 0.5]] * made().ticks)
+    with pytest.raises(CoopenvError, match=r"landmark=offset,landmark=9: landmark: expected a number up to 3, got 9"):
+        changed_by("landmark=offset,landmark=9")
+
+
+def test_an_error_walks_at_random() -> None:
+    """Over time t its variance is the square of its value times t, for each vehicle on its own."""
+    steps = []
+    for seed in range(8):
+        bias = (changed_by("gyro=walk:0.1@1", seed).angular_velocity - made().angular_velocity)[..., 2]
+        assert not bias[made().t < 1.0].any()
+        steps.append(np.diff(bias[60:], axis=0))
+    walked = np.array(steps)
+    assert_allclose(walked.std(), 0.1 * np.sqrt(made().dt), rtol=0.05)
+    assert abs(np.corrcoef(walked[..., 0].ravel(), walked[..., 1].ravel())[0, 1]) < 0.1
+
+
+def test_an_error_comes_and_goes() -> None:
+    bias = changed_by("vehicle_1:gyro=intermittent:0.3@1,share=0.4,burst=0.1", 2).angular_velocity
+    there = (bias - made().angular_velocity)[:, 0, 2].round(9)
+    assert set(there) == {0.0, 0.3} and not there[:60].any()
+    assert 0.2 < np.mean(there[60:] > 0.0) < 0.6
+    assert (np.flatnonzero(np.diff(there)) % 6 == 5).all()  # bursts of six ticks
 
 
 def test_a_share_of_the_bearings_is_random() -> None:

@@ -77,6 +77,55 @@ def test_messages_of_ros_1_and_of_the_authors_are_read_in_bags() -> None:
         assert_rays_of_the_pixels(read(Role.DETECTIONS, Fields(__msgtype__=kind, **fields), CAMERA))
 
 
+def posed(ray: np.ndarray, depth: int) -> Fields:
+    """Return a pose within others: of a stamp and a covariance."""
+    return Fields(pose=posed(ray, depth - 1)) if depth else Fields(position=xyz(*(2.0 * ray)))
+
+
+CORNERS = {
+    n: [(u + du, v + dv) for du, dv in ((-9.0, -7.2), (6.0, -5.4), (8.0, 6.4), (-10.0, 9.0))]
+    for n, (u, v) in PIXELS.items()
+}
+DETECTIONS: dict[str, dict[str, Any]] = {
+    "apriltag_ros/msg/AprilTagDetectionArray": {
+        "detections": [
+            *(Fields(id=np.array([n]), size=np.array([0.1]), pose=posed(ray, 2)) for n, ray in RAYS.items()),
+            Fields(id=np.array([8, 9]), size=np.array([0.1, 0.1]), pose=posed(RAYS[3], 2)),  # a bundle of tags
+        ]
+    },
+    "apriltags_ros/msg/AprilTagDetectionArray": {
+        "detections": [Fields(id=n, size=0.1, pose=posed(ray, 1)) for n, ray in RAYS.items()]
+    },
+    "ar_track_alvar_msgs/msg/AlvarMarkers": {
+        "markers": [Fields(id=n, confidence=0, pose=posed(ray, 1)) for n, ray in RAYS.items()]
+    },
+    "fiducial_msgs/msg/FiducialTransformArray": {
+        "transforms": [
+            Fields(fiducial_id=n, transform=Fields(translation=xyz(*(2.0 * ray)), rotation=None))
+            for n, ray in RAYS.items()
+        ]
+    },
+    "fiducial_msgs/msg/FiducialArray": {
+        "fiducials": [
+            Fields(fiducial_id=n, **{f"{axis}{k}": c[axis == "y"] for k, c in enumerate(corners) for axis in "xy"})
+            for n, corners in CORNERS.items()
+        ]
+    },
+}
+"""Fields of messages of ROS 1 by type; the diagonals of the last ones intersect in the pixels."""
+
+
+@pytest.mark.parametrize("kind", DETECTIONS)
+def test_detections_of_ros_1_are_read(kind: str) -> None:
+    assert_rays_of_the_pixels(read(Role.DETECTIONS, Fields(__msgtype__=kind, **DETECTIONS[kind]), CAMERA))
+
+
+def test_corners_outside_the_image_give_no_bearing() -> None:
+    outside = {f"{axis}{k}": (650.0 if axis == "x" and k == 1 else 100.0 + 9.0 * k) for k in range(4) for axis in "xy"}
+    message = Fields(__msgtype__="fiducial_msgs/msg/FiducialArray", fiducials=[Fields(fiducial_id=3, **outside)])
+    assert read(Role.DETECTIONS, message, CAMERA).markers == ()
+
+
 def test_a_stamp_is_moved_to_the_exposure_of_the_rows_of_the_tags() -> None:
     vision = VisionSettings(exposure=0.01, row_time=2e-5)
     assert vision.late([100.0, 300.0], 480) == 5_000_000 + 4_000_000
