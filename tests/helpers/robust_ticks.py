@@ -52,8 +52,8 @@ NOISE = SensorNoise(velocity=0.1, angular_velocity=0.01, odometry_period=PERIOD,
 STILL: Pose = (np.eye(3), np.zeros(3))
 BIAS, WALK = 1e-3, 1e-4
 """rad/s, of the gyro where no larger one is declared; and its walk in a second."""
-CALIBRATION = np.diag([BIAS**2] * 3 + [1e-14, 1e-14, 1.0])
-"""The covariance of the calibration state of odometry: bias, scale, and two entries without a meaning."""
+CALIBRATION = np.diag([BIAS**2] * 3 + [1e-14] * 3)
+"""The covariance of the calibration state of odometry and frames: bias, scale, focal length and latency."""
 
 
 def known(vehicle: int = 0, noise: SensorNoise = NOISE) -> Setup:

@@ -39,6 +39,14 @@ def made(name: str, overrides: dict[str, Any], start: int | None = None) -> Reco
     return recording if start is None else random_start(recording, start)
 
 
+DECLARED = {
+    "camera.latency": 0.02,
+    "camera.latency_error": 0.01,
+    "camera.latency_jitter": 0.002,
+    "camera.extrinsics_walk": 1e-3,
+    "map.accuracy": 0.05,
+}
+
 RECORDS = {
     "any start": lambda: made("busy_intersection", ISOTROPIC, 2),
     "stale radio": lambda: made("busy_intersection_tracking", STALE),
@@ -47,10 +55,11 @@ RECORDS = {
     "errors that last": lambda: made("busy_intersection_tracking", LASTING),
     "clocks that are off": lambda: made("lane:4", {"faults.clock_offset": 0.05}),
     "driven": lambda: made(FOUR_WAY, {}),
+    "old frames and a map with errors": lambda: made("busy_intersection_tracking", DECLARED),
 }
 
 
-@pytest.mark.parametrize("name", rest_slow(RECORDS, 0, 1, 4, 6))
+@pytest.mark.parametrize("name", rest_slow(RECORDS, 0, 1, 4, 6, 7))
 def test_host_and_world_estimate_the_same(name: str) -> None:
     recording = RECORDS[name]()
     result, played = completed("robust", recording), replayed(recording)
