@@ -35,7 +35,7 @@ FAULT_MODELS = {
     "walk": "walks at random, by its value per square root of a second",
     "intermittent": "comes and goes: it is there for `share` (0.2) of the time, in bursts of `burst` (0.5) s",
 }
-"""How an error goes on from its start, by name."""
+"""Courses of an error from its start, by name."""
 SHARE, BURST = 0.2, 0.5  # of an intermittent error, and s
 
 
