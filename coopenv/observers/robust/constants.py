@@ -89,7 +89,7 @@ MASK_BITS = 64  # vehicles in a mask; numbers from 64 on share bits with lower o
 
 KNOWN_ANGLE, KNOWN_POSITION = 0.2, 2.0
 """Standard deviation per axis (rad and m) below which a pose is a linearisation point and is broadcast. Chosen."""
-VAGUE_ANGLE = 1.0  # standard deviation per axis, rad, above which an orientation is unknown. Chosen
+VAGUE_ANGLE = 5.0 * KNOWN_ANGLE  # standard deviation per axis, rad, above which an orientation is unknown. Chosen
 MAX_HYPOTHESES = 6  # most hypotheses at once: P3P has four solutions at most, the prior is one more. Chosen
 MARGIN = 2.0
 """Standard deviations by which measurements are perturbed to find solutions that noise removes; factor of a neighbour's
