@@ -121,7 +121,6 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         errors = {
             (*LASTING_ERRORS, "camera_focal"): scenario.has_lasting_errors,
             ("camera_delay",): any(camera.is_late for camera in scenario.cameras),
-            ("map_offset",): scenario.landmark_std,
             FAULTS: any(faults.any for faults in scenario.all_faults),
         }
         self._lasting = [name for names, there in errors.items() if there for name in names]

@@ -32,6 +32,9 @@ PerAxis = NonNegative | NonNegativeVector3
 
 Pixels = Annotated[int, Field(ge=1, le=65_535)]
 
+Latency = Annotated[Annotated[float, Field(ge=0.0, le=5.0)], units.LAG]
+"""s; so long the poses of all agents are kept."""
+
 ROTATION_OF_CAMERA = {"forward": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), "body": np.eye(3)}
 """Camera to body: columns are the optical frame's x (right), y (down), z (forward)."""
 
@@ -101,12 +104,12 @@ class Camera(Section):
     bearing on the image plane (at distance 1) are (1 + e) times what they should be; drawn per vehicle and episode."""
     extrinsics_walk: Annotated[NonNegative, units.SMALL_ANGLE] = 0.0
     """Random walk of that rotation, standard deviation per axis, rad per square root of a second."""
-    latency: Annotated[NonNegative, units.LAG] = 0.0
+    latency: Latency = 0.0
     """Age of a frame when its bearings are used, s; observers know it."""
-    latency_error: Annotated[NonNegative, units.LAG] = 0.0
+    latency_error: Latency = 0.0
     """Standard deviation of an error of the latency, s; drawn per vehicle and episode. Frames may thereby be ahead of
     the odometry."""
-    latency_jitter: Annotated[NonNegative, units.LAG] = 0.0
+    latency_jitter: Latency = 0.0
     """Standard deviation of a further error, drawn for every frame, s."""
 
     def to_body(self, pan: float = 0.0) -> np.ndarray:

@@ -11,10 +11,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from coopenv.base.errors import ScenarioError
+import coopenv
+from coopenv.base.errors import ScenarioError, ScenarioWarning
+from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.setups import observer_init_of
 from coopenv.runs import record
-from coopenv.scenario import Scenario
+from coopenv.scenario import Scenario, parse_scenario
 from coopenv.sources.mcap import read_recording, write_recording
 from coopenv.sources.worlds import Replay, SimulatedWorld
 from tests.helpers.builders import (
@@ -86,6 +88,39 @@ def test_a_late_frame_of_a_car_that_speeds_up_steers_and_pans() -> None:
         expected = line / np.linalg.norm(line, axis=-1, keepdims=True)
         assert_allclose(late[2:, 0, target], expected, atol=1.5 * acceleration * latency**2 / 2.0 / distance)
     assert np.linalg.norm(own[-1] - own[0]) > 1.0
+    whole, prompt = (
+        bearings_of(
+            made.model_copy(update={"camera": made.camera.model_copy(update={"latency": age})}), 60, [0.5, 0.8, 1.0]
+        )
+        for age in (2.0 / 60.0, 0.0)
+    )
+    assert_allclose(whole[0][2:], prompt[0][:-2], atol=1e-12)
+
+
+def test_observers_of_ones_own_have_the_age_and_infos_the_delay() -> None:
+    ticks: list[Tick] = []
+
+    class Still:
+        def __init__(self, setup: Setup) -> None:
+            pass
+
+        def reset(self, initial_pose: tuple[np.ndarray, np.ndarray], initial_covariance: np.ndarray) -> None:
+            self.estimate = Estimate(*initial_pose)
+
+        def update(self, tick: Tick) -> Estimate:
+            ticks.append(tick)
+            return self.estimate
+
+        def message(self) -> Message:
+            return Message(position=self.estimate.position)
+
+    made = scenario([vehicle(), vehicle((1.0, 0.0, 0.5), camera={"latency": 0.01})], **ALL)
+    env = coopenv.parallel_env(made, observer=Still, dtype="float64")
+    _, infos = env.reset(seed=1)
+    env.step({agent: np.zeros(2) for agent in env.agents})
+    assert [tick.bearing_age for tick in ticks[:2]] == [0.03, 0.01]
+    assert infos["vehicle_1"]["truth"]["camera_delay"] == env.engine.view("camera_delay")[0, 0] != 0.0
+    assert np.abs(ticks[0].landmarks - env.engine.view("position")[0, :4]).min() > 0.0
 
 
 def ages(states: list[dict[str, np.ndarray]], speed: float, aside: tuple[float, ...]) -> np.ndarray:
@@ -271,10 +306,16 @@ def test_the_switch_of_noise_leaves_the_known_latency_alone() -> None:
     assert states[0].sensed(0, 10).tick(setup, {}).bearing_age == 0.03  # type: ignore[attr-defined]
 
 
+def test_observers_that_ignore_them_are_named() -> None:
+    with pytest.warns(ScenarioWarning, match="'riccati' .* ignores camera.latency, map.accuracy"):
+        parse_scenario(raw(circling(), **ALL), "test")
+
+
 @pytest.mark.parametrize(
     ("sections", "message"),
     [
         ({"camera": {"latency": -0.1}}, "camera.latency"),
+        ({"camera": {"latency": 30.0}}, "camera.latency: .* less than or equal to 5, got 30.*: milliseconds in place"),
         ({"camera": {"latency_std": 0.1}}, "camera.latency_std"),
         ({"noise": {"bearing": {"correlated": {"std": 0.1, "time": 0.0}}}}, "noise.bearing.correlated.time"),
         ({"map": {"accuracy": -1.0}}, "map.accuracy"),

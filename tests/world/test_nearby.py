@@ -57,6 +57,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "faults": {
         "faults": {"clock_offset": 0.05, "map_error": {"chance": 1.0, "offset": 0.5}},
         "randomisation": {"camera_range": [0.7, 1.3]},
+        "map": {"accuracy": 0.2},
     },
 }
 
