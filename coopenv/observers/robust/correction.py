@@ -155,16 +155,26 @@ def turn_of_sight(memory: Any, world: int, i: int, bearings: int, share: Any, la
 
 
 @device_function
+def is_to_landmarks(memory: Any, world: int, i: int, bearings: int) -> bool:
+    """Return whether no bearing that fits is one to a vehicle."""
+    for n in range(bearings):
+        if memory.measurement[world, i, n].fits == 1 and memory.measurement[world, i, n].member > 0:
+            return False
+    return True
+
+
+@device_function
 def next_share(memory: Any, world: int, i: int, bearings: int, first: bool):
     """Return the share of the correction at which to linearise next, 0 if that is near the last linearisation point.
 
-    The share is 1 if the correction turns a line of sight far, else 0.5; 0 if it turns none noticeably.
+    The share is 1 if the correction turns a line of sight far, else 0.5; 0 if it turns none noticeably and vehicles,
+    whose range would be biased, are none of the targets.
     """
     one = wp.float64(1.0)
     turn = turn_of_sight(memory, world, i, bearings, one, wp.float64(0.0))
     share = wp.where(turn >= wp.float64(constants.LINEAR_ANGLE), one, wp.float64(0.5))
     if first:
-        if turn < wp.float64(constants.NOTICEABLE_TURN):
+        if turn < wp.float64(constants.NOTICEABLE_TURN) and is_to_landmarks(memory, world, i, bearings):
             share = wp.float64(0.0)
     else:
         if turn_of_sight(memory, world, i, bearings, share, one) < wp.float64(constants.LINEAR_ANGLE):
@@ -176,7 +186,7 @@ def next_share(memory: Any, world: int, i: int, bearings: int, first: bool):
 def iterated_update(frame: BearingFrame, memory: Any, world: int, i: int):
     """Correct by the bearings that fit, linearised at half of a small correction, or after all of a large one.
 
-    A correction that turns no line of sight by `NOTICEABLE_TURN` is applied as it is.
+    A correction by landmarks alone that turns no line of sight by `NOTICEABLE_TURN` is applied as it is.
 
     For a large correction these are Gauss-Newton steps. For a small one, gain and innovation depend on the same noise:
     two vehicles with little relative motion estimate their range with a bias. The point of linearisation changes it
