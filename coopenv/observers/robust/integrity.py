@@ -73,12 +73,13 @@ def is_evidence(memory: Any, world: int, i: int, n: int, q: int) -> bool:
     """Return whether a bearing counts for the monitor of a source: it fits, or the gate rejects many to its target.
 
     Single outliers are no evidence of a lasting fault. Rejected bearings to a landmark are evidence of its own fault
-    alone.
+    alone until they have been rejected without a pause for longer than a burst of reflections.
     """
     fits = memory.measurement[world, i, n].fits
     target = memory.measurement[world, i, n].source
     rejected = fits == -1 and target >= 0 and is_rejected(memory, world, i, wp.max(target, 0))
-    return fits == 1 or (rejected and (target == q or is_sender(target)))
+    lasting = memory.source[world, i, wp.max(target, 0)].rejected_time > wp.float64(constants.MEAN_TIME)
+    return fits == 1 or (rejected and (target == q or is_sender(target) or lasting))
 
 
 @device_function
