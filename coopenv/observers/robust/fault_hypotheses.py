@@ -3,9 +3,8 @@
 All sources have the same prior odds. The source of a hypothesis that is nearly certain is excluded: unless the gate has
 rejected its bearings, the covariance grows by the difference and the added uncertainty of the solution without it. An
 own sensor stays in use: its fault becomes an error of its calibration, correlated with the error that it has caused.
-Hypotheses that are only likely add to the covariance that is stated and sent, each by its probability. A landmark may
-also come and go: its bearings are then only gated. An excluded source stays under test, and is readmitted when its
-bearings fit without a fault and not with the one it had.
+Hypotheses that are only likely add to the covariance that is stated and sent, each by its probability. An excluded
+source stays under test, and is readmitted when its bearings fit without a fault and not with the one it had.
 """
 
 from typing import Any
@@ -251,7 +250,8 @@ def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: in
         if is_active(memory, world, i, q):
             w = weight_of(memory.source[world, i, q].ratio, most)
             total += w
-            rivals += w * intermittent_odds(memory, world, i, q, worst)
+            if not is_same(q, worst):
+                rivals += w
     certain = worst >= 0 and rivals < wp.float64(constants.FAULT_RISK)
     if not (certain and is_own(worst)) and not lost and exclude_drifting(memory, world, i, landmarks):
         forget_faults(memory, world, i)
@@ -272,21 +272,6 @@ def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: in
 def is_same(q: int, c: int) -> bool:
     """Return whether two slots are the same source; all own sensors count as one, because all of them stay in use."""
     return q == c or (is_own(q) and is_own(c))
-
-
-@device_function
-def intermittent_odds(memory: Any, world: int, i: int, q: int, worst: int):
-    """Return the weight of a source's hypotheses against that of the worst source's fault, relative to its fault's.
-
-    A landmark may be one that comes and goes, by reflections or in front of another one: the gate then acts alone. Both
-    hypotheses explain the rejected bearings, but rejections without a pause become unlikely if they last.
-    """
-    odds = wp.float64(1.0)
-    if is_same(q, worst):
-        odds = wp.float64(0.0)
-        if not is_own(q) and not is_sender(q) and memory.source[world, i, q].rejected_time > wp.float64(0.0):
-            odds = wp.exp(-memory.source[world, i, q].rejected_time / wp.float64(constants.MEAN_TIME))
-    return odds
 
 
 @wp.func
@@ -319,6 +304,7 @@ def test_excluded(frame: BearingFrame, memory: Any, world: int, i: int, n: int, 
     present = wp.dot(a, wp.inverse(A + least * wp.identity(3, wp.float64)) * a)
     gain = wp.dot(f, A * f) - wp.float64(2.0) * wp.dot(f, a)
     fits = present < wp.float64(constants.BEARING_GATE) and gain > wp.float64(constants.BEARING_GATE)
-    if fits and memory.source[world, i, q].time > wp.float64(constants.LONG_TIME):
+    least_time = wp.float64(constants.LONG_TIME) * wp.float64(memory.source[world, i, q].exclusions)
+    if fits and memory.source[world, i, q].time > least_time:
         memory.source[world, i, q].excluded = 0
         clear_source(memory, world, i, q)

@@ -60,7 +60,6 @@ from coopenv.observers.robust.sources import (
     is_own,
     is_rejected,
     is_sender,
-    note_fit,
     note_rejection,
 )
 from coopenv.world.warp_internals import device_function, subroutine
@@ -69,17 +68,14 @@ QUANTILE = NormalDist().inv_cdf(1.0 - 0.5 * constants.RISK)  # of an error along
 
 
 @device_function
-def is_evidence(memory: Any, world: int, i: int, n: int, q: int) -> bool:
-    """Return whether a bearing counts for the monitor of a source: it fits, or the gate rejects many to its target.
+def is_evidence(memory: Any, world: int, i: int, n: int) -> bool:
+    """Return whether a bearing counts for the monitors: it fits, or the gate rejects many bearings to its source.
 
-    Single outliers are no evidence of a lasting fault. Rejected bearings to a landmark are evidence of its own fault
-    alone until they have been rejected without a pause for longer than a burst of reflections.
+    Single outliers are no evidence of a lasting fault.
     """
     fits = memory.measurement[world, i, n].fits
-    target = memory.measurement[world, i, n].source
-    rejected = fits == -1 and target >= 0 and is_rejected(memory, world, i, wp.max(target, 0))
-    lasting = memory.source[world, i, wp.max(target, 0)].rejected_time > wp.float64(constants.MEAN_TIME)
-    return fits == 1 or (rejected and (target == q or is_sender(target) or lasting))
+    q = memory.measurement[world, i, n].source
+    return fits == 1 or (fits == -1 and q >= 0 and is_rejected(memory, world, i, wp.max(q, 0)))
 
 
 @device_function
@@ -92,7 +88,7 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
     vector = memory.source[world, i, q].vector
     A = memory.information[world, i, q, 0]
     for n in range(frame.bearings):
-        if is_evidence(memory, world, i, n, q):
+        if is_evidence(memory, world, i, n):
             H = memory.derivative[world, i, n, 0].jacobian
             M = H * own
             if frame.mounting > 0:
@@ -189,7 +185,7 @@ def add_information(frame: BearingFrame, memory: Any, world: int, i: int, q: int
     """Add the information of a frame on the faults of a source and of a sender."""
     A = memory.information[world, i, q, c]
     for n in range(frame.bearings):
-        if is_evidence(memory, world, i, n, q):
+        if is_evidence(memory, world, i, n):
             A = A + wp.transpose(memory.weighted_effect[world, i, n, q]) * memory.effect[world, i, n, c]
     memory.information[world, i, q, c] = A
 
@@ -214,9 +210,8 @@ def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
         q = memory.measurement[world, i, n].source
         if q >= 0 and memory.measurement[world, i, n].fits == -1:
             note_rejection(memory, world, i, q, weight)
-            memory.source[world, i, q].rejected_time += frame.period
         elif q >= 0 and memory.measurement[world, i, n].fits == 1:
-            note_fit(memory, world, i, q, frame.period)
+            memory.source[world, i, q].fitted_time += frame.period
 
 
 @wp.func

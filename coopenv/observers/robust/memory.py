@@ -110,7 +110,6 @@ class SourceMonitor:
     map_variance: wp.float64  # m^2 per axis, of a landmark's place on the map, as declared
     rejected: wp.float64  # mean share of its bearings that fail the gate
     fitted_time: wp.float64  # s for which its bearings have passed it
-    rejected_time: wp.float64  # s for which most have failed it without a pause
     ratio: wp.float64  # twice the logarithm of the likelihood ratio of its fault to none
     offset: vec3d  # f: its most likely fault, of an excluded one when it was excluded
     covariance: mat33d  # of that fault

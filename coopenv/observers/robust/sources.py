@@ -85,7 +85,6 @@ def clear_drift(memory: Any, world: int, i: int, q: int):
 def clear_source(memory: Any, world: int, i: int, q: int):
     """Clear the information about a source."""
     memory.source[world, i, q].rejected = wp.float64(0.0)
-    memory.source[world, i, q].rejected_time = wp.float64(0.0)
     memory.source[world, i, q].vector = vec3d()
     memory.source[world, i, q].sum = vec3d()
     if is_sender(q):
@@ -215,19 +214,6 @@ def note_rejection(memory: Any, world: int, i: int, q: int, weight: Any):
         clear_source(memory, world, i, q)
         memory.source[world, i, q].rejected = rejected
         memory.source[world, i, q].fitted_time = wp.float64(0.0)
-
-
-@device_function
-def note_fit(memory: Any, world: int, i: int, q: int, period: Any):
-    """Note a bearing that passes the gate. A landmark that had failed it comes and goes, without a lasting fault."""
-    memory.source[world, i, q].fitted_time += period
-    if memory.source[world, i, q].rejected_time > wp.float64(0.0):
-        rejected = memory.source[world, i, q].rejected
-        memory.source[world, i, q].rejected_time = wp.float64(0.0)
-        if is_rejected(memory, world, i, q) and not is_sender(q):
-            clear_source(memory, world, i, q)
-            memory.source[world, i, q].rejected = rejected
-            memory.source[world, i, q].ratio = wp.float64(0.0)
 
 
 @device_function

@@ -314,20 +314,6 @@ def test_a_landmark_that_jumps_costs_no_more_than_without_it(seed: int, end: flo
     assert cost(watched, hidden, 12.0).max() < 1.3
 
 
-@pytest.mark.parametrize("burst", [0.2, 0.5, 1.0])
-def test_reflections_in_bursts_exclude_no_source_and_cost_little(burst: float) -> None:
-    """A fifth of the bearings to each landmark is mirrored in the vehicle's plane of symmetry, in bursts of some s."""
-    recording, rng = busy(24.0, 0), np.random.default_rng(0)
-    bearings, length = recording.bearings.copy(), round(burst / recording.dt)
-    bursts = rng.random((-(-recording.ticks // length), *bearings.shape[1:3])) < 0.2
-    bursts[:, :, recording.landmarks.shape[1] :] = False
-    mirrored = np.repeat(bursts, length, axis=0)[: recording.ticks]
-    bearings[mirrored] *= (1.0, -1.0, 1.0)
-    found = watch(replace(recording, bearings=bearings))
-    assert not found.excluded()
-    assert (cost(found, usual(busy, 24.0, 0), 5.0) < 1.5).all()
-
-
 def test_a_landmark_that_is_right_again_is_readmitted() -> None:
     """It is off by 1 m from 3 s on: until 9 s, and for good."""
     landmark, followers = 2, (0, 2, 3, 4)
