@@ -3,8 +3,9 @@
 A vehicle estimates a joint state of itself and of the vehicles that it receives. Bearings to landmarks and to vehicles
 correct it. A neighbour's message adds the information that is new since its last message. So no information counts
 twice, and the neighbour's slowly varying error does not count as white noise. If most bearings fail the gate, to more
-than one target, the estimate restarts with a larger covariance, and hypotheses of a search compete with it. So they do
-with an uncertain initial estimate. During a search the vehicle broadcasts nothing.
+than one target, all of them count for a while. If that does not help, the estimate restarts with a larger covariance,
+and hypotheses of a search compete with it, as with an uncertain initial estimate. During a search the vehicle
+broadcasts nothing.
 
 After a search, the own pose is resected from one frame alone, and the other members stay. The own covariance becomes
 that of the solution, members' errors included: G (N + H_o P_o H_o^T) G^T with G = (H^T W H)^-1 H^T W. The
@@ -38,7 +39,7 @@ from coopenv.observers.robust.algebra import (
     odometry_noise,
     with_noise,
 )
-from coopenv.observers.robust.correction import iterated_update
+from coopenv.observers.robust.correction import all_count, iterated_update
 from coopenv.observers.robust.correlated_fusion import fuse_messages
 from coopenv.observers.robust.correlations import clear_broadcasts, receive_broadcast, send_broadcast
 from coopenv.observers.robust.fault_hypotheses import detect_and_exclude, test_excluded
@@ -104,6 +105,7 @@ def gate(frame: BearingFrame, memory: Any, world: int, i: int):
     missed = vec2d()
     fitting = int(0)
     total = wp.float64(0.0)
+    failing = frame.purpose == TRACKING and all_count(memory, world, i)
     for n in range(frame.bearings):
         nis = innovation_squared(frame, memory, world, i, n)
         ahead = nis >= wp.float64(0.0) and nis < wp.float64(wp.inf)
@@ -120,7 +122,7 @@ def gate(frame: BearingFrame, memory: Any, world: int, i: int):
         elif ahead and not used:
             test_excluded(frame, memory, world, i, n, q)
         memory.measurement[world, i, n].fits = 0
-        if used and fits:
+        if used and (fits or (failing and ahead)):
             memory.measurement[world, i, n].fits = 1
             fitting += 1
             total += nis
