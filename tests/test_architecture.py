@@ -125,7 +125,9 @@ def test_the_core_grows_no_further() -> None:
     assert lines <= CORE_LINES + STILL_ABOVE, f"{lines} lines; python -m benchmarks.lines shows where they went"
 
 
-@pytest.mark.xfail(strict=True, reason="above the ceiling by 2,750 lines before sensors and drives, by 8,850 with noise and guard")
+@pytest.mark.xfail(
+    strict=True, reason="above the ceiling by 2,750 lines before sensors and drives, by 8,850 with noise and guard"
+)
 def test_the_core_keeps_below_its_ceiling() -> None:
     assert core_lines() <= CORE_LINES
 
