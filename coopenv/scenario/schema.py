@@ -227,8 +227,8 @@ class Scenario(Section, metaclass=_Loaded):
     def landmark_std(self) -> tuple[float, ...]:
         """(L,) standard deviations per axis of the landmarks' positions on the map, m; empty: exact."""
         common = self.map.accuracy
-        std = tuple(common if mark.accuracy is None else mark.accuracy for mark in self.landmarks)
-        return std if self.noise.enabled and any(std) else ()
+        std = [common if mark.accuracy is None else mark.accuracy for mark in self.landmarks]
+        return tuple(std) if self.noise.enabled and any(std) else ()
 
     @property
     def cameras(self) -> list[Camera]:
@@ -511,10 +511,11 @@ def _doubts(s: Scenario, neighbours: Sequence[Sequence[int]]) -> Iterator[str]:
     elif bearings_alone and lonely:
         verb = "has" if len(lonely) == 1 else "have"
         yield f"{listed(lonely)} {verb} fewer than three neighbours: observability is not guaranteed"
-    stated = {"camera.latency": any(camera.is_late for camera in s.cameras), "map.accuracy": s.landmark_std}
-    ignored = [*(sensor.label for sensor in s.sensors), *(key for key, there in stated.items() if there)]
-    if ignored and s.observer.name in BEARINGS_ALONE:
-        yield f"observer '{s.observer.name}' takes the camera's bearings alone and ignores {listed(ignored)}"
+    if s.observer.name in BEARINGS_ALONE:
+        stated = {"camera.latency": any(camera.is_late for camera in s.cameras), "map.accuracy": s.landmark_std}
+        ignored = [*(sensor.label for sensor in s.sensors), *(key for key, there in stated.items() if there)]
+        if ignored:
+            yield f"observer '{s.observer.name}' takes the camera's bearings alone and ignores {listed(ignored)}"
     for sensor in [sensor for sensor in s.sensors if (sensor.rate or 0.0) > s.rates.camera]:
         yield f"sensors.{sensor.label}.rate: {sensor.rate:g} Hz is above rates.camera, {s.rates.camera:g} Hz"
     for landmark in s.landmarks if s.observer.name == "riccati" else ():

@@ -95,7 +95,7 @@ def _undeclared(value: str, meaning: str, unit: str, default: float, change: Cha
 def _of_model(value: str, meaning: str, unit: str, default: float, change: Change) -> RecordFault:
     """Return the same, of an error that goes on by one of `FAULT_MODELS`."""
     return replace(
-        _undeclared(f"MODEL[:{value}]", meaning, unit, default, change),
+        _undeclared(f"MODEL[:{value}]", f"{meaning} by the model {', '.join(FAULT_MODELS)}", unit, default, change),
         words=dict.fromkeys(FAULT_MODELS, default),
         options=OF_BURSTS,
         unused={model: tuple(OF_BURSTS) for model in FAULT_MODELS if model != "intermittent"},
@@ -318,8 +318,7 @@ def variant_rows() -> list[dict[str, str]]:
     named = {name: variant.summary for name, variant in VARIANTS.items()}
     faults = {f"{name}={kind.value}" if kind.value else name: kind.meaning for name, kind in FAULTS.items()}
     robots = {name: about for kind in kinds().values() for name, about in kind.variants.items()}
-    models = {f"MODEL {name}": f"the error {about}" for name, about in FAULT_MODELS.items()}
-    tables = {"environments, logs": named, "recorded robots": robots, "--fault": faults | models}
+    tables = {"environments, logs": named, "recorded robots": robots, "--fault": faults}
     return [{"name": n, "of": of, "about": text} for of, variants in tables.items() for n, text in variants.items()]
 
 

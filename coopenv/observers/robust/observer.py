@@ -310,6 +310,8 @@ def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: PoseEs
 def write(state: Any, memory: Any, world: int, i: int, decides: bool):
     """Write the own estimate to the state; during a search, the best hypothesis's.
 
+    Until measurements have confirmed it, the estimate that is tracked may be as wrong as the one that it began with.
+
     Protection levels are renewed where an agent `decides` by them.
 
     The state holds positions in the body frame and covariances of (2 lambda, p), to first order.
@@ -317,6 +319,11 @@ def write(state: Any, memory: Any, world: int, i: int, decides: bool):
     estimate = estimate_with_faults(memory, world, i)
     if memory.search[world, i].hypotheses > 0:
         estimate = memory.hypothesis[world, i, 0].estimate
+    elif memory.search[world, i].active == 1:
+        anchor = memory.anchor[world, i]
+        step = between(anchor.odometry, memory.belief[world, i].odometry)
+        before = carried(anchor.estimate, step, vec2d())
+        estimate = PoseEstimate(estimate.pose, estimate.P + before.P)
     position = wp.transpose(estimate.pose.R) * estimate.pose.p
     P = symmetric_part(sheared(estimate.P, skew(position)))
     state.estimate_rotation[world, i] = type(state.estimate_rotation[world, i])(estimate.pose.R)
