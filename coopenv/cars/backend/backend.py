@@ -272,7 +272,8 @@ class Svea:
         if tick.truth is not None:
             error = float(np.linalg.norm(p - tick.truth.position[i]))
             turn = float(np.arccos(np.clip(0.5 * (np.vdot(R, tick.truth.rotation[i]) - 1.0), -1.0, 1.0)))
-        self.monitor.judge(name, self.deployment.safety, error, turn, std, sent.protection_level, nis)
+        known = sent.message is None or sent.message.position is not None
+        self.monitor.judge(name, self.deployment.safety, error, turn, std, sent.protection_level, nis, known)
 
     def notes(self, vehicle: int) -> dict[str, Any]:
         """Return the entries of a vehicle's info about its car and the network; it is one that is estimated here."""

@@ -108,7 +108,17 @@ class LinkMonitor:
             recent.append(Place(position, time, velocity))
             self.places = {**self.places, car: recent[-1]}
 
-    def judge(self, car: str, safety: Safety, error: float, turn: float, std: float, level: float, nis: Array) -> None:
+    def judge(
+        self,
+        car: str,
+        safety: Safety,
+        error: float,
+        turn: float,
+        std: float,
+        level: float,
+        nis: Array,
+        known: bool = True,
+    ) -> None:
         """Compare an estimate with the limits.
 
         Args:
@@ -119,6 +129,7 @@ class LinkMonitor:
             std: of its position, m.
             level: horizontal protection level, m; inf: unknown.
             nis: per degree of freedom, of the bearings of its tick.
+            known: whether its observer would broadcast the estimate; one that searches for the pose does not.
         """
         now, recent = self.looked, self._nis.setdefault(car, deque())
         recent.extend((now, float(value)) for value in nis)
@@ -140,7 +151,9 @@ class LinkMonitor:
                 self._doubts[car] = why, since_when
                 self._well.pop(car, None)
                 return
-        if (now - self._well.setdefault(car, now)) * 1e-9 > LASTING:
+        if not known:
+            self._well.pop(car, None)
+        elif (now - self._well.setdefault(car, now)) * 1e-9 > LASTING:
             self._settled.add(car)
         if self.settled(car):
             self._doubts.pop(car, None)
