@@ -65,7 +65,8 @@ def judged(kind: int, R: Array, p: Array, P: Array, frame: Frame, *unused: objec
     S = H.dot(P) @ H.transpose(0, 2, 1) + N
     squared = np.einsum("mr,mr->m", residual, np.linalg.solve(S, residual[..., None])[..., 0])
     fits = (squared >= 0.0) & (squared <= LARGEST) & ahead
-    return squared >= 0.0, fits, 1.0 - float(fits.mean()), float(np.trace(S, axis1=1, axis2=2).max())
+    widest, of_guard = float(np.trace(S, axis1=1, axis2=2).max()), np.zeros((len(S), 3, 2))  # which this filter has not
+    return squared >= 0.0, fits, 1.0 - float(fits.mean()), widest, of_guard
 
 
 def stacked(R: Array, p: Array, frame: Frame) -> Stacked:
