@@ -6,7 +6,7 @@ No observer knows of a fault. The truth is never changed. Every random draw is a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -28,41 +28,6 @@ DIRECTION = np.array([0.6, 0.8, 0.0])
 """Direction of a false position, map axes: horizontal, and along no road."""
 
 
-FAULT_MODELS = {
-    "offset": "is constant",
-    "ramp": "grows to its value at the end of the run",
-    "drift": "grows by its value every second",
-    "walk": "walks at random, by its value per square root of a second",
-    "intermittent": "comes and goes: it is there for `share` (0.2) of the time, in bursts of `burst` (0.5) s",
-}
-"""Courses of an error from its start, by name."""
-SHARE, BURST = 0.2, 0.5  # of an intermittent error, and s
-
-
-def amount(recording: Recording, fault: Fault, seed: int) -> np.ndarray:
-    """Return (K, N) how large the error of a fault is in each vehicle, by its model (default: a constant one)."""
-    since = recording.t - fault.start_in(float(recording.t[-1]))
-    begun, shape = since > -1e-6 * recording.dt, (recording.ticks, len(recording.setups))
-    passed = np.broadcast_to(np.maximum(0.0, since)[:, None], shape)
-    if fault.word == "walk":
-        steps = np.random.default_rng([seed, 10]).standard_normal(shape) * math.sqrt(recording.dt)
-        course = np.cumsum(steps * (since > 0.5 * recording.dt)[:, None], axis=0)
-    elif fault.word == "intermittent":
-        course = np.where(bursts(recording, fault, seed, shape[1:]), 1.0, 0.0)
-    else:
-        lengths = {"drift": 1.0, "ramp": max(float(since[-1]), recording.dt)}
-        course = passed / lengths[fault.word] if fault.word in lengths else np.ones(shape)
-    return np.asarray(fault.value * course * np.outer(begun, _on(recording, fault)))
-
-
-def bursts(recording: Recording, fault: Fault, seed: int, of: Sequence[int], share: float | None = None) -> np.ndarray:
-    """Return (K, ...) whether an error that comes and goes is there, drawn anew for every burst of each of several."""
-    length = max(1, round(fault.options.get("burst", BURST) / recording.dt))
-    drawn = np.random.default_rng([seed, 4]).random((math.ceil(recording.ticks / length), *of))
-    there = drawn < (fault.options.get("share", SHARE) if share is None else share)
-    return np.repeat(there, length, axis=0)[: recording.ticks]
-
-
 def with_sensors(recording: Recording, names: Iterable[str]) -> Recording:
     """Keep the measurements of some sensors alone, by their names; the camera's is "camera"."""
     kept, scenario = set(names), recording.scenario
@@ -80,6 +45,41 @@ def with_sensors(recording: Recording, names: Iterable[str]) -> Recording:
         changes["visible"] = np.zeros_like(recording.visible)
         changes["bearings"] = np.full_like(recording.bearings, np.nan)
     return replace(recording, **changes)
+
+
+def amount(recording: Recording, fault: Fault, seed: int) -> np.ndarray:
+    """Return (K, N) how large the error of a fault is in each vehicle, by its model (default: a constant one)."""
+    since = recording.t - fault.start_in(float(recording.t[-1]))
+    begun, passed = since > -1e-6 * recording.dt, np.tile(np.maximum(0.0, since), (len(recording.setups), 1)).T
+    course = FAULT_MODELS[fault.word or "offset"](recording, fault, seed, passed)
+    return np.asarray(fault.value * course * np.outer(begun, _on(recording, fault)))
+
+
+def _walked(recording: Recording, fault: Fault, seed: int, passed: np.ndarray) -> np.ndarray:
+    """Return random walks (K, N) of variance 1 per second, from the tick after the start on."""
+    steps = np.random.default_rng([seed, 10]).standard_normal(passed.shape) * math.sqrt(recording.dt)
+    return np.asarray(np.cumsum(steps * (passed > 0.5 * recording.dt), axis=0))
+
+
+def bursts(recording: Recording, fault: Fault, seed: int, of: Sequence[int], share: float) -> np.ndarray:
+    """Return (K, ...) whether an error that comes and goes is there, drawn anew for every burst of each of several."""
+    length = max(1, round(fault.options.get("burst", BURST) / recording.dt))
+    drawn = np.random.default_rng([seed, 4]).random((math.ceil(recording.ticks / length), *of))
+    return np.repeat(drawn < share, length, axis=0)[: recording.ticks]
+
+
+SHARE, BURST = 0.2, 0.5  # of the time in which an intermittent error is there, and s
+FAULT_MODELS: dict[str, Callable[[Recording, Fault, int, np.ndarray], np.ndarray]] = {
+    "offset": lambda recording, fault, seed, passed: np.ones_like(passed),
+    "ramp": lambda recording, fault, seed, passed: passed / max(float(passed[-1].max()), recording.dt),
+    "drift": lambda recording, fault, seed, passed: passed,
+    "walk": _walked,
+    "intermittent": lambda recording, fault, seed, passed: bursts(
+        recording, fault, seed, passed.shape[1:], fault.options.get("share", SHARE)
+    ),
+}
+"""Course (K, N) of an error of size 1, given the time (K, N) since its start, s: constant, growing to the end, growing
+every second, walking at random, or there in bursts."""
 
 
 def with_deliveries(recording: Recording, kept: np.ndarray) -> Recording:
@@ -165,14 +165,14 @@ def with_late_frames(recording: Recording, fault: Fault, seed: int) -> Recording
 
 def with_correlated_bearings(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Add a Gauss-Markov error of first order to bearings, drawn per vehicle and target."""
-    generator, time = np.random.default_rng([seed, 5]), fault.options.get("time", 1.0)
+    from scipy.signal import lfilter  # late: `coopenv list variants` imports this module
+
+    time = fault.options.get("time", 1.0)
     kept = math.exp(-recording.dt / time) if time > 0.0 else 0.0
-    error = np.zeros(recording.bearings.shape[1:])
-    bearings = recording.bearings.copy()
-    for k in range(recording.ticks):
-        fresh = fault.value * generator.standard_normal(error.shape)
-        error = fresh if k == 0 else kept * error + math.sqrt(1.0 - kept**2) * fresh
-        bearings[k] += error * _on(recording, fault)[:, None, None]
+    steps = np.random.default_rng([seed, 5]).standard_normal(recording.bearings.shape)
+    steps[1:] *= math.sqrt(1.0 - kept**2)
+    error = fault.value * lfilter([1.0], [1.0, -kept], steps, axis=0)
+    bearings = recording.bearings + error * _on(recording, fault)[:, None, None]
     bearings /= np.linalg.norm(bearings, axis=-1, keepdims=True)
     return replace(recording, bearings=bearings)
 

@@ -195,6 +195,19 @@ def _place_of(marker: Any) -> Array:
     return np.array([place.x, place.y, place.z], dtype=np.float64)
 
 
+def diagonals_crossing(corners: Array, ahead: Array) -> Array:
+    """Return the rays (m, 3) where the diagonals of quadrilaterals intersect.
+
+    Args:
+        corners: (m, 4, 3) rays of the corners, of any length and sign, in their order.
+        ahead: (m, 3) a vector on the side of the target.
+    """
+    first, second = (np.cross(corners[:, n], corners[:, n + 2]) for n in range(2))
+    centre = np.cross(first, second)
+    centre /= np.linalg.norm(centre, axis=-1, keepdims=True) * np.sign((centre * ahead).sum(axis=-1))[:, None]
+    return np.asarray(centre)
+
+
 def _corners(message: Any, _settings: VisionSettings, camera: Calibration) -> list[Tag]:
     """Return the markers of a FiducialArray, which has the pixels of corners: the ray is where diagonals intersect."""
     pixels = np.array(
@@ -202,11 +215,8 @@ def _corners(message: Any, _settings: VisionSettings, camera: Calibration) -> li
     ).reshape(-1, 4, 2)
     with np.errstate(all="ignore"):  # values that are not finite give no ray
         corners, there = rays(pixels.reshape(-1, 2), camera)
-        c = corners.reshape(-1, 4, 3)
-        centre = np.cross(np.cross(c[:, 0], c[:, 2]), np.cross(c[:, 1], c[:, 3]))
-        centre /= (
-            np.linalg.norm(centre, axis=-1, keepdims=True) * np.sign((centre * c.sum(axis=1)).sum(axis=-1))[:, None]
-        )
+        corners = corners.reshape(-1, 4, 3)
+        centre = diagonals_crossing(corners, corners.sum(axis=1))
     whole = np.asarray(there.reshape(-1, 4).all(axis=-1) & np.isfinite(centre).all(axis=-1))
     areas = np.ptp(pixels, axis=1).prod(axis=-1)
     rows = zip(message.fiducials, areas, centre, pixels[..., 1].mean(axis=-1), whole, strict=True)
@@ -365,10 +375,9 @@ def find_tags(gray: NDArray[np.uint8], family: str, camera: Calibration) -> list
     moments = np.einsum("msk,mski,mskj->msij", weights, units, units)
     planes = np.linalg.eigh(moments)[1][..., 0]  # (m, 4, 3) normals
     turned = np.cross(np.roll(planes, 1, axis=1), planes)  # (m, 4, 3) corners
-    centre = np.cross(np.cross(turned[:, 0], turned[:, 2]), np.cross(turned[:, 1], turned[:, 3]))
     ahead = np.einsum("msk,mski->mi", weights, units)
     with np.errstate(all="ignore"):
-        centre /= np.linalg.norm(centre, axis=-1, keepdims=True) * np.sign((centre * ahead).sum(axis=-1))[:, None]
+        centre = diagonals_crossing(turned, ahead)
     areas = [opencv().contourArea(quad) for quad in corners.astype(np.float32)]
     full = (np.count_nonzero(weights, axis=-1) >= LEAST).all(axis=-1) & np.isfinite(centre).all(axis=-1)
     rows = zip(numbers.ravel().tolist(), areas, centre, corners[..., 1].mean(axis=-1).tolist(), full, strict=True)

@@ -62,8 +62,8 @@ equally likely. Chosen."""
 MONITOR_TIME = 10.0  # s: time constant of the sums of a monitor. Chosen
 OWN_FAULT = 0.1  # deviation of a fault of velocity and focal length, as a share, gyro, rad/s, and camera, rad. Chosen
 LOST_SHARE, FOUND_SHARE = 0.6, 0.2
-"""Share of bearings that fail the gate from which on a vehicle counts as lost, and share below which it is not and its
-pose is an anchor. Chosen: one wrong association of two does not exceed the first."""
+"""Share of bearings that fail the gate from which on it opens, and share below which it closes and the pose is an
+anchor. Chosen: one wrong association of two does not exceed the first."""
 
 # Messages
 

@@ -183,8 +183,8 @@ def next_share(memory: Any, world: int, i: int, bearings: int, first: bool):
 
 
 @device_function
-def all_count(memory: Any, world: int, i: int) -> bool:
-    """Return whether bearings count that fail the gate, because most have failed it since a short time."""
+def gate_is_open(memory: Any, world: int, i: int) -> bool:
+    """Return whether the gate is open: bearings that fail it count, too, while most fail and no search has begun."""
     return memory.belief[world, i].lost_time > wp.float64(0.0) and memory.search[world, i].active == 0
 
 
@@ -205,7 +205,7 @@ def iterated_update(frame: BearingFrame, memory: Any, world: int, i: int):
     for k in range(memory.belief[world, i].members):
         memory.scratch[world, i, k].last_correction = vec6d()
         memory.scratch[world, i, k].pose = memory.member[world, i, k].pose
-    if is_known(memory.P[world, i, 0, 0]) and not all_count(memory, world, i):
+    if is_known(memory.P[world, i, 0, 0]) and not gate_is_open(memory, world, i):
         gate_jointly(memory, world, i, bearings)
     else:  # innovations after the first one are not linear enough to reject any
         correct_by_bearings(memory, world, i, bearings, False)

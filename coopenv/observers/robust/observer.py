@@ -39,7 +39,7 @@ from coopenv.observers.robust.algebra import (
     odometry_noise,
     with_noise,
 )
-from coopenv.observers.robust.correction import all_count, iterated_update
+from coopenv.observers.robust.correction import gate_is_open, iterated_update
 from coopenv.observers.robust.correlated_fusion import fuse_messages
 from coopenv.observers.robust.correlations import clear_broadcasts, receive_broadcast, send_broadcast
 from coopenv.observers.robust.fault_hypotheses import detect_and_exclude, test_excluded
@@ -105,7 +105,7 @@ def gate(frame: BearingFrame, memory: Any, world: int, i: int):
     missed = vec2d()
     fitting = int(0)
     total = wp.float64(0.0)
-    failing = frame.purpose == TRACKING and all_count(memory, world, i)
+    is_open = frame.purpose == TRACKING and gate_is_open(memory, world, i)
     for n in range(frame.bearings):
         nis = innovation_squared(frame, memory, world, i, n)
         ahead = nis >= wp.float64(0.0) and nis < wp.float64(wp.inf)
@@ -122,7 +122,7 @@ def gate(frame: BearingFrame, memory: Any, world: int, i: int):
         elif ahead and not used:
             test_excluded(frame, memory, world, i, n, q)
         memory.measurement[world, i, n].fits = 0
-        if used and (fits or (failing and ahead)):
+        if used and (fits or (is_open and ahead)):
             memory.measurement[world, i, n].fits = 1
             fitting += 1
             total += nis
@@ -167,7 +167,7 @@ def confirm(memory: Any, world: int, i: int):
 
 @device_function
 def note_rejections(model: Any, memory: Any, world: int, i: int, share: Any, now: Any):
-    """Declare the vehicle lost if most bearings have failed the gate for long; end a search if few do.
+    """Open the gate if most bearings fail it, declare the vehicle lost if that lasts, and end a search if few do.
 
     A frame counts for the time since the last one with bearings, within `NEWS_TIME`. Most bearings fail if the own pose
     is wrong. If only one source's bearings fail, that source is as likely wrong.
