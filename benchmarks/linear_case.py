@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 
 from coopenv.estimation.poses import Array
-from coopenv.observers.robust.constants import RETURNING_SHARE
+from coopenv.observers.robust.constants import DISTINCT_VARIANCES
 from coopenv.report.table import Table
 
 SOURCES = 512
@@ -166,7 +166,7 @@ def second_encounter() -> Receiver:
     """Return a receiver that meets again the sender from which its own pose comes, at the limit of the order."""
     sources = Sources()
     sender = sources.draw(1.0)
-    receiver = Receiver(sources, sender + sources.draw(1.0 / RETURNING_SHARE - 1.0))
+    receiver = Receiver(sources, sender + sources.draw(DISTINCT_VARIANCES - 1.0))
     receiver.add(sender)
     receiver.measure(1)
     return receiver
@@ -177,8 +177,9 @@ def circle() -> Receiver:
     sources = Sources()
     own = sources.draw(1.0)
     receiver = Receiver(sources, own)
-    share = 0.8 * np.sqrt(RETURNING_SHARE)
-    receiver.add(share * own + sources.draw(RETURNING_SHARE - share**2), factor=2.0)
+    variance = 1.0 / DISTINCT_VARIANCES
+    share = 0.8 * np.sqrt(variance)
+    receiver.add(share * own + sources.draw(variance - share**2), factor=2.0)
     receiver.measure(1)
     return receiver
 

@@ -32,7 +32,7 @@ STAGES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("first linearisation", ("gate",)),
     ("iterated correction", ("iterated_update",)),
     ("monitors", ("correct_sources", "detect_and_exclude", "propagate_sources")),
-    ("search", ("advance_search", "resect", "propagate_search")),
+    ("search", ("advance_search", "propagate_search")),
     ("protection level", ("write",)),
 )
 FOLDER = "coopenv.observers.robust"

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 from scipy.special import chdtri
 
 # Risk, numbers and times
@@ -10,7 +11,8 @@ RISK = 1e-3  # of a correct measurement outside its gate, and of an error above 
 BEARING_GATE, OFFSET_GATE, POSE_GATE = (float(chdtri(axes, RISK)) for axes in (2, 3, 6))
 """Gates of a normalised squared error: of a bearing, of a fault, and of a pose."""
 ROUNDING = 1e-9  # share of its variances by which a covariance may fail to be positive definite
-SINGLE = 1e-6  # share of a variance that rounding to single precision in messages may change
+SINGLE = 8.0 * float(np.finfo(np.float32).eps)
+"""Share of a variance that rounding to single precision in messages may change: eight roundings."""
 MAX_CONDITION = 1.0 / SINGLE**2  # of the information of a frame; from there on it determines no pose
 MIN_VARIANCE = 1e-14  # rad^2 and m^2, below which a covariance is malformed: 0.1 um
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
@@ -70,20 +72,20 @@ anchor. Chosen: one wrong association of two does not exceed the first."""
 NEWS_TIME = 0.2
 """Period (s) of fusing a sender's reports; reports in between contribute their odometry alone. Also the time for which
 all solutions of a search must be well determined, and the delay after a frame in which they are not. Chosen."""
-STEPS = 127  # of a correlation in a message, from 0 to 1
+STEPS = int(np.iinfo(np.int8).max)  # of a correlation in a message, from 0 to 1
 MAX_CORRELATIONS = 2  # in a message, which has 256 bytes then
-CORRELATION_VALIDITY = 1.037
-"""Longest time (s) between two reports for which the correlation of one is used for the other. It hardly changes in a
-second, and a missing correlation is worse. No multiple of usual frame periods. Chosen."""
-RETURNING_SHARE = 0.7
-"""Ratio of the variances of the sender's and the own position above which bearings to a sender are not used, if the
-sender depends on this vehicle or on an unknown correlation. No circle of vehicles then confirms itself. Tuned: at 1 the
-order changes too often, and at 0.5 many bearings are unused."""
-RESET_GROWTH = 0.5  # growth of a sender's variance, as a share of it, that counts as a reset. Chosen
+VALID_TIME = MEAN_TIME + SAME_TIME
+"""Longest time (s) between two reports for which the correlation of one is used for the other, and out of view for
+which a member is not evicted. A correlation hardly changes in a second, and a missing one is worse."""
+DISTINCT_VARIANCES = 1.44
+"""Least ratio of two variances of a position that are not alike, whose deviations differ by a fifth. A sender's reset multiplies its variance by more. From
+a sender that depends on this vehicle, or on an unknown correlation, bearings are used if the own variance is larger by
+it: no circle of vehicles then confirms itself. Tuned: at 1 the order changes too often, and at 2 many bearings are
+unused."""
 LEAST_NEWS = 0.1
 """Share of a sender's variance that counts as noise of its increment: linearisation errors of small corrections add up.
 Tuned."""
-MASK_BITS = 64  # vehicles in a mask; numbers from 64 on share bits with lower ones
+MASK_BITS = np.iinfo(np.uint64).bits  # vehicles in a mask; higher numbers share bits with lower ones
 
 # Search
 

@@ -210,7 +210,7 @@ def sender_reset_detected(memory: Any, world: int, i: int, n: int, dt: Any) -> b
     before = memory.P[world, i, n, n]
     spread = algebra.position_variance(before)
     grown = algebra.position_variance(P) - spread
-    if grown > wp.float64(constants.RESET_GROWTH) * spread:
+    if grown > wp.float64(constants.DISTINCT_VARIANCES - 1.0) * spread:
         inflate_dependents(memory, world, i, n, wp.float64(THIRD) * grown)
         clear_drift(memory, world, i, memory.member[world, i, n].source)
     if dt > wp.float64(constants.SHORT_TIME):
@@ -319,7 +319,7 @@ def next_new_sender(model: Any, state: Any, memory: Any, world: int, i: int, las
     for n in range(entry_count(model, state, world, i)):
         entry = entry_at(model, state, kept, world, i, n)
         box = box_of_entry(model, entry)
-        seen = is_seen(memory, state, world, i, entry, tick)
+        seen = is_seen(state, world, i, entry, tick)
         if seen and is_received(model, state, memory, world, i, box, tick):
             sender = sender_of(model, state, world, i, box)
             if index_of(memory, world, i, sender) == 0:

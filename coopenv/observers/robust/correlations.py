@@ -219,7 +219,7 @@ def matrix_of(memory: Any, world: int, i: int, box: int, c: int):
 @wp.func
 def is_near(model: Any, tick: int, other: int) -> bool:
     """Return whether the correlation of a report at one tick is valid for a report at another."""
-    return wp.float64(wp.abs(tick - other)) * model.camera_period < wp.float64(constants.CORRELATION_VALIDITY)
+    return wp.float64(wp.abs(tick - other)) * model.camera_period <= wp.float64(constants.VALID_TIME)
 
 
 @device_function

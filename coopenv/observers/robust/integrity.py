@@ -367,19 +367,6 @@ def own_variances(up: Any, P: Any):
 
 
 @wp.func
-def fault_variances(up: Any, Phi: Any, C: Any):
-    """Return the same sums for an error Phi f: Phi 6x3, and C 3x3 the covariance of the fault f."""
-    vertical = vec3d()
-    variances = vec2d()
-    for i in range(3):
-        variances[0] += wp.dot(Phi[i + 3], C * Phi[i + 3])
-        variances[1] += wp.dot(Phi[i], C * Phi[i])
-        vertical += up[i] * Phi[i + 3]
-    variances[0] -= wp.dot(vertical, C * vertical)
-    return variances
-
-
-@wp.func
 def levels(up: Any, variances: Any, mean: Any):
     """Return (2,) bounds of horizontal, m, and angular errors, rad: a left error of mean (6,) and variances (2,).
 
@@ -413,7 +400,7 @@ def protection_level(memory: Any, world: int, i: int):
             # Before its first block, or since an exclusion; gyro and camera have the covariance of a prior then.
             if q < CAMERA and information == wp.float64(0.0) and wp.ddot(Phi, Phi) > wp.float64(0.0):
                 return vec2d(wp.float64(wp.inf))
-            variances = own + fault_variances(up, Phi, memory.source[world, i, q].covariance)
+            variances = own + own_variances(up, (Phi * memory.source[world, i, q].covariance) * wp.transpose(Phi))
             if not (
                 variances[0] < wp.float64(KNOWN_POSITION_VARIANCE) and variances[1] < wp.float64(KNOWN_ANGLE_VARIANCE)
             ):

@@ -39,11 +39,9 @@ from coopenv.observers.robust.memory import (
     vec4d,
     vec6d,
 )
-from coopenv.observers.robust.sources import VELOCITY, guarded_covariance, is_seen, propagate_sources
+from coopenv.observers.robust.sources import VELOCITY, is_seen, propagate_sources
 from coopenv.world.nearby import agent_of, entry_at, entry_count
 from coopenv.world.warp_internals import device_function, subroutine
-
-MAX_UNSEEN_TIME = constants.MEAN_TIME + constants.SAME_TIME
 
 
 @device_function
@@ -82,12 +80,6 @@ def own_estimate(memory: Any, world: int, i: int):
     return PoseEstimate(memory.member[world, i, 0].pose, memory.P[world, i, 0, 0])
 
 
-@device_function
-def estimate_with_faults(memory: Any, world: int, i: int):
-    """Return the own estimate with the covariance that is stated."""
-    return PoseEstimate(memory.member[world, i, 0].pose, guarded_covariance(memory, world, i))
-
-
 @subroutine
 def propagate(memory: Any, world: int, i: int, n: int, step: Pose, noise: Any):
     """Propagate a member by an increment of odometry with noise."""
@@ -96,12 +88,6 @@ def propagate(memory: Any, world: int, i: int, n: int, step: Pose, noise: Any):
         if k != n:
             set_block(memory, world, i, n, k, forward(step, memory.P[world, i, n, k]))
     memory.P[world, i, n, n] = with_noise(propagated(memory.P[world, i, n, n], step), noise)
-
-
-@device_function
-def apply_error(memory: Any, world: int, i: int, n: int, error: Any):
-    """Move a member's pose by an error."""
-    memory.member[world, i, n].pose = displaced(memory.member[world, i, n].pose, error)
 
 
 @device_function
@@ -125,7 +111,7 @@ def apply_corrections(memory: Any, world: int, i: int):
             memory.member[world, i, k].w += correction[:3]
             memory.member[world, i, k].v += correction[3:]
         else:
-            apply_error(memory, world, i, k, correction)
+            memory.member[world, i, k].pose = displaced(memory.member[world, i, k].pose, correction)
             memory.scratch[world, i, k].recentring = recentring(correction)
             recentre(memory, world, i, k, memory.scratch[world, i, k].recentring)
 
@@ -169,7 +155,7 @@ def mark_seen(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
     for n in range(entry_count(model, state, world, i)):
         entry = entry_at(model, state, kept, world, i, n)
         target = agent_of(state, kept, world, i, entry)
-        if target >= model.landmarks and is_seen(memory, state, world, i, entry, tick):
+        if target >= model.landmarks and is_seen(state, world, i, entry, tick):
             member = index_of(memory, world, i, target - model.landmarks)
             if member > 0:
                 memory.member[world, i, member].seen_tick = tick
@@ -179,7 +165,7 @@ def mark_seen(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
 def make_room(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
     """Return whether there is room for another member, after an eviction if needed and possible.
 
-    Evicted is the member that has been out of view for longest, unless that is within `MAX_UNSEEN_TIME`.
+    Evicted is the member that has been out of view for longest, unless that is within `VALID_TIME`.
     """
     first = memory.belief[world, i].first_sender
     members = memory.belief[world, i].members
@@ -190,7 +176,7 @@ def make_room(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
         if memory.member[world, i, n].seen_tick < memory.member[world, i, longest_unseen].seen_tick:
             longest_unseen = n
     unseen = wp.float64(tick - memory.member[world, i, longest_unseen].seen_tick) * model.camera_period
-    if unseen <= wp.float64(MAX_UNSEEN_TIME):
+    if unseen <= wp.float64(constants.VALID_TIME):
         return False
     remove_member(memory, world, i, longest_unseen)
     return True

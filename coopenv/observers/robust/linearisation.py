@@ -19,7 +19,7 @@ from coopenv.observers.robust.memory import (
     mat26d,
     vec3d,
 )
-from coopenv.observers.robust.readings import is_reading, linearise_reading
+from coopenv.observers.robust.readings import linearise_reading
 from coopenv.world.warp_internals import device_function, subroutine
 
 
@@ -46,7 +46,7 @@ def approach(memory: Any, world: int, i: int, member: int, turn: Any, point: Any
 @subroutine
 def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     """Linearise the n-th bearing, residual = H x + noise; return whether its target is ahead of the camera."""
-    if is_reading(memory, world, i, n):
+    if memory.measurement[world, i, n].is_reading == 1:
         return linearise_reading(memory, world, i, n)
     member = memory.measurement[world, i, n].member
     point = memory.measurement[world, i, n].point

@@ -41,7 +41,6 @@ UNIFORM_VARIANCE = THIRD
 """Variance of a uniform distribution over [-1, 1], the paper's noise on the image plane."""
 ROUNDING_VARIANCE = 1.0 / 12.0  # of a number that is rounded to integers
 MOST_FOCAL_EFFECT = 0.25  # squared turn of a bearing by a relative error of the focal length, at 45 degrees
-SEARCH, RESECTION, TRACKING = 0, 1, 2  # purpose of a frame
 
 
 @device_function
@@ -73,6 +72,8 @@ def set_bearing_measurement(memory: Any, world: int, i: int, n: int, member: int
     memory.measurement[world, i, n].point = point
     memory.measurement[world, i, n].variance = variance
     memory.measurement[world, i, n].source = -1
+    memory.measurement[world, i, n].is_reading = 0
+    memory.measurement[world, i, n].rows = 2
 
 
 @device_function
@@ -126,14 +127,14 @@ def set_mapped_point(model: Any, state: Any, memory: Any, world: int, i: int, fr
     std = wp.float64(model.landmark_std[target])
     variance = std * std
     q = int(-1)
-    if frame.purpose == TRACKING:
+    if frame.searching == 0:
         q = take_slot(memory, world, i, target, frame.tick, True, model.camera_period)
         if q >= 0:
             memory.source[world, i, q].map_variance = variance
             variance = wp.float64(0.0)
         else:
             variance *= frames_in(wp.float64(constants.CONSIDERED_LINEARISATION_TIME), frame.period)
-    elif frame.purpose == SEARCH:
+    else:
         variance *= factor_in_search(memory, world, i, frame)
     set_bearing_measurement(memory, world, i, frame.bearings, 0, vec3d(), point, variance)
     memory.measurement[world, i, frame.bearings].source = q
@@ -152,8 +153,8 @@ def set_measurement_of_member(
     """Set the frame's next bearing as one to a member that has moved since its last fused report.
 
     The member is propagated by its broadcast odometry, and from there by its last twist. Before a second report its
-    twist is unknown: its bearing is then used for a resection only, with a `possible_speed` as in the search; the
-    function returns whether it is used. Errors that are the same in several frames count once in all of them.
+    twist is unknown, and the bearing is not used; the function returns whether it is. Errors that are the same in
+    several frames count once in all of them.
     """
     stands = memory.member[world, i, member].report.tick
     box = memory.member[world, i, member].box
@@ -173,15 +174,11 @@ def set_measurement_of_member(
         time = wp.abs(age)
         variance += odometry_noise(model, i, time)[1] * frames_in(time, frame.period) + away * away
         if memory.member[world, i, member].has_twist == 0:
-            if frame.purpose == TRACKING:
-                return False
-            going = possible_speed(memory, world, i) * age
-            variance += going * going
-        else:
-            half_turn = memory.member[world, i, member].w * (wp.float64(0.5) * age)
-            gone = gone + turned * (exp_so3(half_turn) * memory.member[world, i, member].v * age)
-            averaged = frames_in(averaging_time(model, i), frame.period)
-            variance += memory.member[world, i, member].velocity_variance * age * age * averaged
+            return False
+        half_turn = memory.member[world, i, member].w * (wp.float64(0.5) * age)
+        gone = gone + turned * (exp_so3(half_turn) * memory.member[world, i, member].v * age)
+        averaged = frames_in(averaging_time(model, i), frame.period)
+        variance += memory.member[world, i, member].velocity_variance * age * age * averaged
     set_bearing_measurement(memory, world, i, frame.bearings, member, b, gone, variance)
     return True
 
@@ -192,11 +189,11 @@ def set_measurement_of_target(
 ) -> bool:
     """Set the frame's next measurement to the bearing to a target in view; return whether it is usable."""
     b = vec3d(body_bearing(model, state, world, i, entry))
-    if frame.purpose != TRACKING and mounting_of(memory, world, i) > 0:
+    if frame.searching == 1 and mounting_of(memory, world, i) > 0:
         b = memory.member[world, i, MOUNTING].pose.R * b
     target = agent_of(state, model.kept, world, i, entry)
     sender = target - model.landmarks
-    if frame.purpose == SEARCH and is_excluded(memory, world, i, slot_of(memory, world, i, target)):
+    if frame.searching == 1 and is_excluded(memory, world, i, slot_of(memory, world, i, target)):
         return False
     if sender < 0:
         set_mapped_point(model, state, memory, world, i, frame, target)
@@ -204,7 +201,7 @@ def set_measurement_of_target(
         return True
     box = box_of_entry(model, entry)
     received = is_received(model, state, memory, world, i, box, frame.tick)
-    if frame.purpose == SEARCH:
+    if frame.searching == 1:
         if received:
             variance = received_variance(model, memory, world, i, box, frame)
             point = memory.inbox[world, i, box].pose.p
@@ -214,12 +211,11 @@ def set_measurement_of_target(
     if member == 0:
         return False
     q = memory.member[world, i, member].source
-    if frame.purpose == TRACKING and is_circular(memory, world, i, member) and not is_excluded(memory, world, i, q):
+    if is_circular(memory, world, i, member) and not is_excluded(memory, world, i, q):
         return False
     usable = set_measurement_of_member(model, memory, world, i, frame, member, received, b)
-    if frame.purpose == TRACKING:
-        memory.measurement[world, i, frame.bearings].source = q
-        memory.source[world, i, q].seen_tick = frame.tick
+    memory.measurement[world, i, frame.bearings].source = q
+    memory.source[world, i, q].seen_tick = frame.tick
     return usable
 
 
@@ -233,18 +229,18 @@ def motion_since(memory: Any, world: int, i: int, age: Any):
 
 
 @subroutine
-def set_bearing_measurements(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, purpose: int):
+def set_bearing_measurements(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, searching: bool):
     """Set the usable bearings to landmarks and vehicles as measurements, and return their frame.
 
-    In a search, vehicles have their reported positions, otherwise their estimated ones.
+    While `searching`, vehicles have their reported positions, otherwise their estimated ones.
     """
     frame = BearingFrame()
-    frame.purpose = purpose
+    frame.searching = wp.where(searching, 1, 0)
     frame.tick = now.tick
     frame.lever = vec3d(model.camera[i].position)
     frame.variance = bearing_variance(model, i)
     frame.period = now.period
-    if purpose != SEARCH:  # since the last frame that has corrected the belief, one tick at least
+    if not searching:  # since the last frame that has corrected the belief, one tick at least
         since = wp.float64(now.tick - state.corrected_tick[world, i]) * model.camera_period
         frame.period = wp.max(since, now.period)
     R = camera_to_body(model, state, world, i)
@@ -257,7 +253,7 @@ def set_bearing_measurements(model: Any, state: Any, memory: Any, world: int, i:
     frame.jitter = jitter * jitter
     focal = memory.P[world, i, ERRORS, ERRORS][FOCAL_ERROR, FOCAL_ERROR]
     latency = memory.P[world, i, ERRORS, ERRORS][LATENCY_ERROR, LATENCY_ERROR]
-    if purpose == TRACKING:
+    if not searching:
         frame.mounting = mounting_of(memory, world, i)
         frame.errors = wp.where(wp.max(focal, latency) > wp.float64(constants.MIN_VARIANCE), ERRORS, 0)
     else:

@@ -161,7 +161,6 @@ class Search:
     """A search for the pose."""
 
     active: wp.int32
-    found: wp.int32  # whether at this tick
     prior: PoseEstimate  # the tracked estimate, while the belief's arrays serve one hypothesis after the other
     hypotheses: wp.int32  # how many
     tracked_time: wp.float64  # s for which hypotheses have been tracked
@@ -185,7 +184,7 @@ class Hypothesis:
 class BearingFrame:
     """Properties that all bearings of a frame share; small, because functions receive copies of their arguments."""
 
-    purpose: wp.int32  # see measurements.py
+    searching: wp.int32  # 1: its bearings are those of hypotheses
     tick: wp.int32
     bearings: wp.int32  # how many bearings can be used
     mounting: wp.int32  # the member that stands for the camera's mounting, 0 if there is none or it counts as noise
@@ -205,6 +204,8 @@ class BearingMeasurement:
 
     member: wp.int32  # its target; 0: a point in the map
     source: wp.int32  # the slot of its monitor, -1: none
+    is_reading: wp.int32  # 0: a bearing of the camera, 1: of another sensor
+    rows: wp.int32  # how many of its two rows were measured
     bearing: vec3d  # body frame
     point: vec3d  # m, in the member's body or in the map
     variance: wp.float64  # m^2, of the point per axis
@@ -222,8 +223,7 @@ class BearingMeasurement:
 class FusedReading:
     """The rest of a measurement of a sensor beside the camera, two of its rows at most; scratch, see readings.py."""
 
-    part: wp.int32  # which pair of its rows, from 0 on; -1: it is a bearing of the camera
-    used: wp.int32  # how many of these rows it has
+    part: wp.int32  # which pair of its rows, from 0 on
     kind: wp.int32  # its place in the table of kinds
     rotation: mat33d  # sensor to body
     place: vec3d  # m, of the sensor in the body
@@ -417,7 +417,7 @@ def robust_rules() -> dict[str, Rule]:
     """Return the rules of a saved memory by field, see `coopenv.world.state`."""
     members = ROBUST_SIZES["K"]
     flags = (
-        "search.active search.found outbox.valid inbox.valid belief.has_sample belief.map_errors member.has_twist "
+        "search.active outbox.valid inbox.valid belief.has_sample belief.map_errors member.has_twist "
         "source.excluded member.correlation_unknown member.report.valid outbox.carries_correlations "
         "inbox.carries_correlations member.report.carries_correlations"
     )

@@ -117,7 +117,8 @@ def is_circular(memory: Any, world: int, i: int, n: int) -> bool:
     if not shares:
         return False
     own = algebra.position_variance(memory.P[world, i, 0, 0])
-    return algebra.position_variance(memory.member[world, i, n].report.P) > wp.float64(constants.RETURNING_SHARE) * own
+    theirs = algebra.position_variance(memory.member[world, i, n].report.P)
+    return wp.float64(constants.DISTINCT_VARIANCES) * theirs > own
 
 
 def write(observer: Any) -> Message:

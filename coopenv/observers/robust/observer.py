@@ -6,10 +6,6 @@ twice, and the neighbour's slowly varying error does not count as white noise. I
 than one target, all of them count for a while. If that does not help, the estimate restarts with a larger covariance,
 and hypotheses of a search compete with it, as with an uncertain initial estimate. During a search the vehicle
 broadcasts nothing.
-
-After a search, the own pose is resected from one frame alone, and the other members stay. The own covariance becomes
-that of the solution, members' errors included: G (N + H_o P_o H_o^T) G^T with G = (H^T W H)^-1 H^T W. The
-cross-covariances become -G H_o P_o.
 """
 
 from dataclasses import replace
@@ -31,10 +27,8 @@ from coopenv.observers.robust.algebra import (
     carried,
     distance_squared,
     inflated,
-    inverse6,
     inverse_factor,
     is_known,
-    is_regular,
     is_vague,
     odometry_noise,
     with_noise,
@@ -46,20 +40,17 @@ from coopenv.observers.robust.fault_hypotheses import detect_and_exclude, test_e
 from coopenv.observers.robust.guard import guard_covariance
 from coopenv.observers.robust.integrity import correct_sources, protection_level
 from coopenv.observers.robust.joint_state import (
-    apply_error,
     begin_belief,
     begin_errors,
-    estimate_with_faults,
     increment_noise,
     own_estimate,
     propagate_own,
     set_anchor,
-    set_block,
     take_odometry,
     walk_errors,
 )
 from coopenv.observers.robust.linearisation import innovation_squared
-from coopenv.observers.robust.measurements import RESECTION, TRACKING, set_bearing_measurements
+from coopenv.observers.robust.measurements import set_bearing_measurements
 from coopenv.observers.robust.memory import (
     ROBUST_SIZES,
     BearingFrame,
@@ -71,17 +62,15 @@ from coopenv.observers.robust.memory import (
     Search,
     clear,
     mat33d,
-    mat66d,
     memory_struct,
     robust_rules,
     vec2d,
     vec3d,
-    vec6d,
 )
 from coopenv.observers.robust.messages import ROBUST_MESSAGES, bit_of
-from coopenv.observers.robust.readings import add_readings, is_reading, rows_in, rows_of_kind, unused_rows
+from coopenv.observers.robust.readings import add_readings, rows_in, rows_of_kind
 from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
-from coopenv.observers.robust.sources import begin_monitors, begin_sources, is_excluded
+from coopenv.observers.robust.sources import begin_monitors, begin_sources, guarded_covariance, is_excluded
 from coopenv.world.embedded import Embedded
 from coopenv.world.nearby import is_target
 from coopenv.world.v2x import start_covariance
@@ -95,7 +84,7 @@ INFLATION = constants.SQUARED_MARGIN**2  # of an anchor's covariance for the nex
 
 @subroutine
 def gate(frame: BearingFrame, memory: Any, world: int, i: int):
-    """Linearise the bearings and gate them; return the share of rejected ones, the number of used ones, and their NIS.
+    """Linearise the bearings and gate them; return the share of rejected ones, the rows of used ones, and their NIS.
 
     Bearings to excluded sources are not used and do not count in the share, nor do measurements without a target. The
     share is the larger one of the camera's bearings and of the other sensors' measurements, -1 if none counts: ranges
@@ -103,9 +92,9 @@ def gate(frame: BearingFrame, memory: Any, world: int, i: int):
     """
     counted = vec2d()
     missed = vec2d()
-    fitting = int(0)
+    rows = int(0)
     total = wp.float64(0.0)
-    is_open = frame.purpose == TRACKING and gate_is_open(memory, world, i)
+    is_open = gate_is_open(memory, world, i)
     for n in range(frame.bearings):
         nis = innovation_squared(frame, memory, world, i, n)
         ahead = nis >= wp.float64(0.0) and nis < wp.float64(wp.inf)
@@ -113,7 +102,7 @@ def gate(frame: BearingFrame, memory: Any, world: int, i: int):
         q = memory.measurement[world, i, n].source
         used = not is_excluded(memory, world, i, q)
         if used and memory.measurement[world, i, n].distance < wp.float64(wp.inf):
-            kind = wp.where(is_reading(memory, world, i, n), 1, 0)
+            kind = memory.measurement[world, i, n].is_reading
             counted[kind] = counted[kind] + wp.float64(1.0)
             if not fits:
                 missed[kind] = missed[kind] + wp.float64(1.0)
@@ -124,15 +113,15 @@ def gate(frame: BearingFrame, memory: Any, world: int, i: int):
         memory.measurement[world, i, n].fits = 0
         if used and (fits or (is_open and ahead)):
             memory.measurement[world, i, n].fits = 1
-            fitting += 1
+            rows += memory.measurement[world, i, n].rows
             total += nis
-        elif used and ahead and frame.purpose == TRACKING:  # for the monitors
+        elif used and ahead:  # for the monitors
             memory.measurement[world, i, n].fits = -1
     share = wp.float64(-1.0)
     for kind in range(2):
         if counted[kind] > wp.float64(0.0):
             share = wp.max(share, missed[kind] / counted[kind])
-    return share, fitting, total
+    return share, rows, total
 
 
 @wp.func
@@ -207,10 +196,10 @@ def note_rejections(model: Any, memory: Any, world: int, i: int, share: Any, now
 @device_function
 def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, frame: BearingFrame):
     """Correct the belief by the bearings of a frame that pass the gate, and test all sources, but not in a search."""
-    share, fitting, nis = gate(frame, memory, world, i)
+    share, rows, nis = gate(frame, memory, world, i)
     state.nis[world, i] = nis
-    state.nis_dof[world, i] = 2 * fitting - unused_rows(memory, world, i, frame.bearings)
-    if fitting > 0 or share >= wp.float64(0.0):  # rejected bearings show faults
+    state.nis_dof[world, i] = rows
+    if rows > 0 or share >= wp.float64(0.0):  # rejected bearings show faults
         if memory.search[world, i].active == 0:
             guard_covariance(frame, memory, world, i)
         iterated_update(frame, memory, world, i)
@@ -224,64 +213,6 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
             detect_and_exclude(memory, world, i, block, model.landmarks)
     if share >= wp.float64(0.0):
         note_rejections(model, memory, world, i, share, now)
-
-
-@subroutine
-def write_resected_covariance(memory: Any, world: int, i: int, bearings: int):
-    """Set the own covariance to that of the resection, members' errors included; (H^T W H)^-1 is in `scratch.row`."""
-    members = memory.belief[world, i].members
-    memory.P[world, i, 0, 0] = mat66d()
-    for k in range(members):
-        memory.scratch[world, i, k].column = mat66d()
-    for n in range(bearings):
-        if memory.measurement[world, i, n].fits == 1:
-            HtW = wp.transpose(memory.derivative[world, i, n, 0].jacobian) * memory.measurement[world, i, n].weight
-            own = memory.P[world, i, 0, 0] + (HtW * wp.transpose(HtW)) * memory.measurement[world, i, n].noise
-            memory.P[world, i, 0, 0] = own
-            member = memory.measurement[world, i, n].member
-            if member > 0:
-                memory.scratch[world, i, member].column += HtW * memory.derivative[world, i, n, 1].jacobian
-    for k in range(1, members):
-        cross = mat66d()
-        for j in range(1, members):
-            cross += memory.scratch[world, i, j].column * memory.P[world, i, j, k]
-        own = memory.P[world, i, 0, 0] + cross * wp.transpose(memory.scratch[world, i, k].column)
-        memory.P[world, i, 0, 0] = own
-        set_block(memory, world, i, 0, k, -(memory.scratch[world, i, 0].row * cross))
-    inverse = memory.scratch[world, i, 0].row
-    memory.P[world, i, 0, 0] = symmetric_part(inverse * memory.P[world, i, 0, 0] * wp.transpose(inverse))
-
-
-@subroutine
-def resect(frame: BearingFrame, memory: Any, world: int, i: int) -> bool:
-    """Resect the own pose from a frame by least squares; return whether in all steps three bearings determine it."""
-    bearings = frame.bearings
-    for step in range(constants.MAX_ITERATIONS):
-        _, fitting, _ = gate(frame, memory, world, i)
-        M = mat66d()
-        b = vec6d()
-        for n in range(bearings):
-            if memory.measurement[world, i, n].fits == 1:
-                N = memory.measurement[world, i, n].noise * wp.identity(2, wp.float64)
-                member = memory.measurement[world, i, n].member
-                if member > 0:  # the variance includes the error of the target
-                    G = memory.derivative[world, i, n, 1].jacobian
-                    N = N + (G * memory.P[world, i, member, member]) * wp.transpose(G)
-                memory.measurement[world, i, n].weight = wp.inverse(N)
-                H = memory.derivative[world, i, n, 0].jacobian
-                HtW = wp.transpose(H) * memory.measurement[world, i, n].weight
-                M += HtW * H
-                b += HtW * memory.measurement[world, i, n].residual
-        if fitting < 3:
-            return False
-        inverse = inverse6(M)
-        if not is_regular(M, inverse, wp.float64(constants.MAX_CONDITION)):
-            return False
-        if step < constants.MAX_ITERATIONS - 1:
-            apply_error(memory, world, i, 0, inverse * b)
-        memory.scratch[world, i, 0].row = inverse
-    write_resected_covariance(memory, world, i, bearings)
-    return True
 
 
 @subroutine
@@ -316,7 +247,7 @@ def write(state: Any, memory: Any, world: int, i: int, decides: bool):
 
     The state holds positions in the body frame and covariances of (2 lambda, p), to first order.
     """
-    estimate = estimate_with_faults(memory, world, i)
+    estimate = PoseEstimate(memory.member[world, i, 0].pose, guarded_covariance(memory, world, i))
     if memory.search[world, i].hypotheses > 0:
         estimate = memory.hypothesis[world, i, 0].estimate
     elif memory.search[world, i].active == 1:
@@ -366,8 +297,7 @@ def start(model: Any, state: Any, memory: Any, world: int, i: int):
 @device_function
 def is_tracking(memory: Any, world: int, i: int) -> bool:
     """Return whether messages and bearings correct the belief; not in a search that began with no orientation."""
-    searching = memory.search[world, i].active == 1 and memory.search[world, i].found == 0
-    return not (searching and is_vague(memory.anchor[world, i].estimate.P))
+    return memory.search[world, i].active == 0 or not is_vague(memory.anchor[world, i].estimate.P)
 
 
 # A tick in parts; with `Embedded.parts` each is a kernel of its own on a GPU.
@@ -390,20 +320,25 @@ def propagate_belief(model: Any, state: Any, memory: Any, world: int, i: int, no
 
 @subroutine
 def accept_hypothesis(model: Any, memory: Any, world: int, i: int):
-    """Make the single hypothesis that is left the estimate; if the tracked one agrees with it, end the search."""
+    """End a search by the single hypothesis that is left: it is the estimate, unless the tracked one agrees with it.
+
+    A hypothesis that is too uncertain is tracked for some more frames.
+    """
     found = memory.hypothesis[world, i, 0].estimate
     tracked = own_estimate(memory, world, i)
     if is_known(tracked.P) and distance_squared(tracked, found) < wp.float64(constants.POSE_GATE):
         confirm(memory, world, i)
-    else:
+    elif is_known(wp.float64(constants.SQUARED_MARGIN) * found.P):
         restart_belief(model, memory, world, i, found)
-        memory.search[world, i].found = 1
+        memory.search[world, i] = Search()
+    else:
+        least = memory.search[world, i].tracked_time + wp.float64(constants.NEWS_TIME)
+        memory.search[world, i].least_time = least
 
 
 @device_function
 def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
-    """Search for the pose if it is not known."""
-    memory.search[world, i].found = 0
+    """Search for the pose if it is not known, after the tracked estimate: no bearing of a tick corrects both."""
     if memory.search[world, i].active == 1 and now.due:
         if advance_search(model, state, memory, world, i, now):
             accept_hypothesis(model, memory, world, i)
@@ -418,20 +353,11 @@ def fuse(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
 
 @device_function
 def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
-    """Correct the belief by a frame; a pose that the search has just found is resected from this frame alone."""
+    """Correct the belief by a frame."""
     if now.due and is_tracking(memory, world, i):
-        found = memory.search[world, i].found == 1
-        frame = set_bearing_measurements(model, state, memory, world, i, now, wp.where(found, RESECTION, TRACKING))
-        if not found:
-            frame.bearings = add_readings(memory, model, state, world, i, frame)
-            update(model, state, memory, world, i, now, frame)
-        else:
-            determined = resect(frame, memory, world, i)
-            if determined and is_known(wp.float64(constants.SQUARED_MARGIN) * memory.P[world, i, 0, 0]):
-                memory.search[world, i] = Search()
-            else:  # track the remaining hypothesis for some more frames
-                least = memory.search[world, i].tracked_time + wp.float64(constants.NEWS_TIME)
-                memory.search[world, i].least_time = least
+        frame = set_bearing_measurements(model, state, memory, world, i, now, False)
+        frame.bearings = add_readings(memory, model, state, world, i, frame)
+        update(model, state, memory, world, i, now, frame)
 
 
 @device_function
@@ -477,7 +403,7 @@ def with_own(numbers: tuple[int, ...]) -> Embedded:
 
 ROBUST = Embedded(
     "robust",
-    (propagate_belief, search, fuse, correct, conclude),
+    (propagate_belief, fuse, correct, search, conclude),
     start,
     send_broadcast,
     RobustMemory,

@@ -131,19 +131,18 @@ def set_target(model: Any, state: Any, memory: Any, world: int, i: int, frame: B
 @device_function
 def set_pairs(model: Any, state: Any, memory: Any, world: int, i: int, first: int, sensor: int, entry: int) -> int:
     """Set the pairs of rows of a measurement, of which the first has its target; return how many they are."""
-    rows = model.sensor[sensor].rows
-    pairs = (rows + 1) // 2
+    pairs = (model.sensor[sensor].rows + 1) // 2
     memory.reading[world, i, first].kind = model.sensor[sensor].kind
     memory.reading[world, i, first].rotation = mat33d(model.sensor[sensor].rotation)
     memory.reading[world, i, first].place = vec3d(model.sensor[sensor].position)
     memory.reading[world, i, first].value = vec6d(state.reading[world, i, sensor, entry])
     memory.reading[world, i, first].std = vec6d(model.sensor[sensor].counted)
+    memory.measurement[world, i, first].is_reading = 1
     for part in range(pairs):
         n = first + part
         memory.measurement[world, i, n] = memory.measurement[world, i, first]
         memory.reading[world, i, n] = memory.reading[world, i, first]
         memory.reading[world, i, n].part = part
-        memory.reading[world, i, n].used = wp.min(rows - 2 * part, 2)
     return pairs
 
 
@@ -156,10 +155,7 @@ def add_readings(memory: RobustMemory, model: Any, state: Any, world: int, i: in
 @overload_of(add_readings, subroutine=True)
 def add_readings_with_sensors(memory: Any, model: Any, state: Any, world: int, i: int, frame: BearingFrame) -> int:
     """Add the measurements of other sensors to the frame's bearings; return the number of all."""
-    for n in range(frame.bearings):
-        memory.reading[world, i, n].part = -1
     own = BearingFrame()
-    own.purpose = frame.purpose
     own.tick = frame.tick
     own.bearings = frame.bearings
     for sensor in range(model.sensor.shape[0]):
@@ -185,34 +181,6 @@ def add_readings_with_sensors(memory: Any, model: Any, state: Any, world: int, i
                 if usable:
                     own.bearings += set_pairs(model, state, memory, world, i, n, sensor, entry)
     return own.bearings
-
-
-@device_function
-def is_reading(memory: RobustMemory, world: int, i: int, n: Any) -> bool:
-    """Return whether a measurement is one of a sensor beside the camera."""
-    return False
-
-
-@overload_of(is_reading)
-def is_reading_with_sensors(memory: Any, world: int, i: int, n: Any) -> bool:
-    """Return whether a measurement is one of a sensor beside the camera."""
-    return memory.reading[world, i, n].part >= 0
-
-
-@device_function
-def unused_rows(memory: RobustMemory, world: int, i: int, count: Any) -> int:
-    """Return how many rows of the measurements that fit were not measured."""
-    return 0
-
-
-@overload_of(unused_rows)
-def unused_rows_with_sensors(memory: Any, world: int, i: int, count: Any) -> int:
-    """Return how many rows of the measurements that fit were not measured."""
-    unused = int(0)
-    for n in range(count):
-        if memory.reading[world, i, n].part >= 0 and memory.measurement[world, i, n].fits == 1:
-            unused += 2 - memory.reading[world, i, n].used
-    return unused
 
 
 @device_function
@@ -305,7 +273,7 @@ def linearise_reading_with_sensors(memory: Any, world: int, i: int, n: Any) -> b
                 G[k, j] = scale * member_turn[j]
                 G[k, j + 3] = scale * member_shift[j]
             used += 1
-    memory.reading[world, i, n].used = used
+    memory.measurement[world, i, n].rows = used
     memory.derivative[world, i, n, 0] = Derivative(0, H)
     memory.measurement[world, i, n].by_map = -(H[:, 3:] * wp.transpose(own.R))
     memory.derivative[world, i, n, 1] = Derivative(wp.where(member > 0, member, -1), G)

@@ -20,7 +20,7 @@ from coopenv.observers.robust.algebra import carried, distance_squared, inverse6
 from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.joint_state import begin_belief, own_estimate, set_block
 from coopenv.observers.robust.linearisation import innovation_squared, innovation_with, linearise, tangent_basis
-from coopenv.observers.robust.measurements import SEARCH, frames_in, set_bearing_measurements
+from coopenv.observers.robust.measurements import frames_in, set_bearing_measurements
 from coopenv.observers.robust.memory import (
     ERRORS,
     MOUNTING,
@@ -330,7 +330,7 @@ def begin_hypotheses(frame: BearingFrame, memory: Any, world: int, i: int, perio
 @subroutine
 def update_hypotheses(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> bool:
     """Update the hypotheses by a frame; return whether a single one is left after some frames."""
-    frame = set_bearing_measurements(model, state, memory, world, i, now, SEARCH)
+    frame = set_bearing_measurements(model, state, memory, world, i, now, True)
     beginning = memory.search[world, i].hypotheses == 0
     triple = wp.vec3i(-1, -1, -1)
     solved = int(0)

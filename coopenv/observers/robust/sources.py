@@ -13,7 +13,6 @@ from coopenv.observers.robust.memory import (
     BlockSums,
     GuardTotals,
     Pose,
-    RobustMemory,
     SourceMonitor,
     fill,
     mat33d,
@@ -23,7 +22,7 @@ from coopenv.observers.robust.memory import (
     vec6d,
 )
 from coopenv.world.camera import VISIBLE
-from coopenv.world.warp_internals import device_function, overload_of, subroutine
+from coopenv.world.warp_internals import device_function, subroutine
 
 VELOCITY, PRIOR, FOCAL, CAMERA, GYRO = 0, SOURCES - 4, SOURCES - 3, SOURCES - 2, SOURCES - 1
 """Slots of the own velocity, initial position, focal length, camera's mounting and angular velocity; slots of senders
@@ -32,13 +31,7 @@ NO_TARGET = -1
 
 
 @device_function
-def is_seen(memory: RobustMemory, state: Any, world: int, i: int, entry: int, tick: int) -> bool:
-    """Return whether the target of an entry is measured at a tick."""
-    return state.sight[world, i, entry] == VISIBLE
-
-
-@overload_of(is_seen)
-def is_seen_with_sensors(memory: Any, state: Any, world: int, i: int, entry: int, tick: int) -> bool:
+def is_seen(state: Any, world: int, i: int, entry: int, tick: int) -> bool:
     """Return whether the target of an entry is measured at a tick, by the camera or by another sensor."""
     for sensor in range(state.reading_tick.shape[2]):
         if state.reading_tick[world, i, sensor, entry] == tick:

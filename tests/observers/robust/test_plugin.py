@@ -14,7 +14,7 @@ from coopenv.bench.observers.convergence import random_start
 from coopenv.bench.observers.faults import VARIANTS
 from coopenv.observers import run
 from coopenv.observers.robust.constants import RISK
-from coopenv.observers.robust.integrity import QUANTILE, fault_variances, levels, own_variances
+from coopenv.observers.robust.integrity import QUANTILE, levels, own_variances
 from tests.helpers.recordings import completed
 from tests.helpers.robust_ticks import OpenRobust
 from tests.helpers.robust_worlds import everybody_sees_everybody, noise_free, small_errors
@@ -85,7 +85,7 @@ def test_messages_in_cycles_make_no_vehicle_overconfident():
 
 
 DRAWS = 400_000
-CALLS = Calls(__name__, {}, {levels: "3 2 6 > 2", own_variances: "3 66 > 2", fault_variances: "3 63 33 > 2"})
+CALLS = Calls(__name__, {}, {levels: "3 2 6 > 2", own_variances: "3 66 > 2"})
 
 
 def levels_of(R: Any, P: Any, mean: Any) -> np.ndarray:
@@ -130,11 +130,3 @@ def test_errors_along_the_vertical_do_not_count() -> None:
     R = Rotation.from_rotvec([0.4, -0.9, 2.0]).as_matrix()
     up = np.concatenate([np.zeros(3), R.T @ [0.0, 0.0, 1.0]])
     assert_allclose(levels_of(R, np.outer(up, up), 5.0 * up), 0.0, atol=1e-6)
-
-
-def test_variances_of_a_fault_are_those_of_its_covariance() -> None:
-    rng = np.random.default_rng(3)
-    up, Phi, root = Rotation.random(rng=rng).as_matrix()[2], rng.normal(size=(6, 3)), rng.normal(size=(3, 3))
-    C = root @ root.T
-    expected = CALLS(own_variances, "float64", up[None], (Phi @ C @ Phi.T)[None])
-    assert_allclose(CALLS(fault_variances, "float64", up[None], Phi[None], C[None]), expected, rtol=1e-10)
