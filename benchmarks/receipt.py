@@ -88,7 +88,7 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
             memory.source[world, i, q].ratio = wp.float64(0.0)
 
     @device_function
-    def no_drift(memory: Any, world: int, i: int, landmarks: int) -> bool:
+    def no_drift(memory: Any, world: int, i: int) -> bool:
         return False
 
     @device_function
@@ -110,7 +110,6 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
     return {
         "nothing": [],
         "joint gate of bearings": [(correction, "gate_jointly", no_joint_gate)],
-        "established pose": [(constants, "MODEL_ERROR", 0.0)],
         "prior": [(integrity, "own_fault_variance", without(PRIOR))],
         "focal length": [(integrity, "own_fault_variance", without(FOCAL))],
         "all monitors": [(constants, "FAULT_GATE", 1e30)],
@@ -123,10 +122,7 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
         "restarts when lost": [(constants, "LOST_SHARE", 2.0)],
         "gyro bias": [(constants, "GYRO_BIAS", 1e-6), (constants, "GYRO_BIAS_WALK", 1e-6)],
         "senders' increments": [(correlated_fusion, "apply_sender_increment", no_increment)],
-        "linearisation variance": [
-            (constants, "LINEARISATION_TIME", 0.0),
-            (constants, "CONSIDERED_LINEARISATION_TIME", 0.0),
-        ],
+        "linearisation variance": [(constants, "CONSIDERED_LINEARISATION_TIME", 0.0)],
     }
 
 

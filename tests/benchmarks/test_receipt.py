@@ -8,8 +8,8 @@ from benchmarks.receipt import changes_of, constant_table, parts
 def test_every_part_and_several_together_replace_what_exists() -> None:
     for part in parts():
         assert all(hasattr(module, name) for module, name, _ in changes_of(part))
-    together = changes_of("readmission + prior+established pose")
-    assert [name for _, name, _ in together] == ["test_excluded", "own_fault_variance", "MODEL_ERROR"]
+    together = changes_of("readmission + prior+restarts when lost")
+    assert [name for _, name, _ in together] == ["test_excluded", "own_fault_variance", "LOST_SHARE"]
 
 
 def test_a_ratio_has_the_standard_error_over_the_seeds() -> None:

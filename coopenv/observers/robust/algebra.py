@@ -172,16 +172,6 @@ def forward(step: Pose, M: Any):
 
 
 @wp.func
-def forward_error(step: Pose, e: Any):
-    """Return F e for an error (6,), see `forward`."""
-    Rt = wp.transpose(step.R)
-    result = vec6d()
-    result[:3] = Rt * e[:3]
-    result[3:] = Rt * (e[3:] + wp.cross(e[:3], step.p))
-    return result
-
-
-@wp.func
 def propagated(P: Any, step: Pose):
     """Return F P F^T for a symmetric 6x6 matrix P, see `forward`."""
     return forward(step, wp.transpose(forward(step, P)))

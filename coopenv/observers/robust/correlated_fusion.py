@@ -137,10 +137,6 @@ def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any):
         memory.scratch[world, i, k].correction = gain * d
         for j in range(k, members):
             set_block(memory, world, i, k, j, memory.P[world, i, k, j] - gain * memory.scratch[world, i, j].column)
-    q = memory.member[world, i, n].source
-    for k in range(first_sender):
-        e = memory.drift_effect[world, i, q - 1, k] - memory.scratch[world, i, k].correction
-        memory.drift_effect[world, i, q - 1, k] = e
     for k in range(first_sender, members):
         memory.scratch[world, i, k].correction = vec6d()
     apply_corrections(memory, world, i)

@@ -30,12 +30,10 @@ from coopenv.observers.robust.memory import (
     vec3d,
     vec6d,
 )
-from coopenv.observers.robust.messages import includes
 from coopenv.observers.robust.sources import (
     CAMERA,
     FOCAL,
     GYRO,
-    PRIOR,
     VELOCITY,
     clear_drift,
     clear_source,
@@ -109,16 +107,6 @@ def set_walk(memory: Any, world: int, i: int):
 
 
 @device_function
-def inflate_by_drift(memory: Any, world: int, i: int, q: int):
-    """Add to the covariance the square of the own error by a sender's drift."""
-    for o in range(memory.belief[world, i].first_sender):
-        for j in range(o + 1):
-            a = memory.drift_effect[world, i, q - 1, o]
-            block = memory.P[world, i, o, j] + wp.outer(a, memory.drift_effect[world, i, q - 1, j])
-            set_block(memory, world, i, o, j, block)
-
-
-@device_function
 def forget_faults(memory: Any, world: int, i: int):
     """Begin all sums anew; excluded sources stay so."""
     for c in range(SOURCES):
@@ -143,11 +131,10 @@ def exclude(memory: Any, world: int, i: int, q: int):
         return
     drift_time = wp.float64(0.0)
     if drifts(memory, world, i, q):
-        inflate_by_drift(memory, world, i, q)
         memory.source[world, i, q].offset = -memory.source[world, i, q].drift
+        memory.source[world, i, q].covariance = mat33d()
         drift_time = memory.source[world, i, q].drift_time
-    else:
-        inflate_by_fault(memory, world, i, q)
+    inflate_by_fault(memory, world, i, q)
     f = memory.source[world, i, q].offset
     clear_source(memory, world, i, q)
     memory.source[world, i, q].offset = f
@@ -171,24 +158,11 @@ def drifts(memory: Any, world: int, i: int, q: int) -> bool:
 
 
 @device_function
-def upstream_fault_explains_drift(memory: Any, world: int, i: int, q: int, landmarks: int) -> bool:
-    """Return whether a sender depends on another sender with a fault that would explain its drift."""
-    depends_on = memory.member[world, i, member_of(memory, world, i, q)].report.depends_on
-    for c in range(1, 1 + SENDER_SLOTS):
-        vehicle = memory.source[world, i, c].target - landmarks
-        if c != q and is_active(memory, world, i, c) and includes(depends_on, vehicle):
-            evidence = wp.max(memory.source[world, i, c].ratio, memory.source[world, i, c].drift_ratio)
-            if evidence > wp.float64(constants.ODDS):
-                return True
-    return False
-
-
-@device_function
-def exclude_drifting(memory: Any, world: int, i: int, landmarks: int) -> bool:
-    """Exclude all senders that drift, and return whether there are any; no other fault explains their drift."""
+def exclude_drifting(memory: Any, world: int, i: int) -> bool:
+    """Exclude all senders that drift, and return whether there are any."""
     found = bool(False)
     for q in range(1, 1 + SENDER_SLOTS):
-        if drifts(memory, world, i, q) and not upstream_fault_explains_drift(memory, world, i, q, landmarks):
+        if drifts(memory, world, i, q):
             exclude(memory, world, i, q)
             found = True
     return found
@@ -210,31 +184,14 @@ def set_fault_mixture(memory: Any, world: int, i: int, most: Any, total: Any):
     memory.fault_mixture[world, i] = symmetric_part(mixture)
 
 
-@device_function
-def discount_rivals(memory: Any, world: int, i: int):
-    """Discount the evidence against other targets while the gate rejects one that has fitted before.
-
-    The gate compares that target with a pose on which all of them had agreed.
-    """
-    established = bool(False)
-    for q in range(1, PRIOR):
-        if is_active(memory, world, i, q) and is_rejected(memory, world, i, q):
-            if memory.source[world, i, q].fitted_time > wp.float64(constants.MEAN_TIME):
-                established = True
-    for q in range(1, PRIOR):
-        if established and not is_rejected(memory, world, i, q):
-            memory.source[world, i, q].ratio *= wp.float64(1.0 - constants.MODEL_ERROR)
-
-
 @subroutine
-def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: int):
+def detect_and_exclude(memory: Any, world: int, i: int, time: Any):
     """Weigh the hypotheses after a block of a time, s; exclude the source of one nearly certain, own sensors first.
 
     Soon after it began, a fault of the gyro looks like one of the camera: if both are likelier than none, both
     count as faulty. While most bearings fail the gate, innovations of a wrong pose reveal faults of own sensors only.
     """
     end_block(memory, world, i, time)
-    discount_rivals(memory, world, i)
     memory.fault_mixture[world, i] = mat66d()
     lost = memory.belief[world, i].lost_time > wp.float64(0.0)
     gate = wp.float64(constants.FAULT_GATE)
@@ -253,7 +210,7 @@ def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: in
             if not is_same(q, worst):
                 rivals += w
     certain = worst >= 0 and rivals < wp.float64(constants.FAULT_RISK)
-    if not (certain and is_own(worst)) and not lost and exclude_drifting(memory, world, i, landmarks):
+    if not (certain and is_own(worst)) and not lost and exclude_drifting(memory, world, i):
         forget_faults(memory, world, i)
         return
     if certain and (is_own(worst) or not lost):

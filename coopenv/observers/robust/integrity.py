@@ -12,8 +12,7 @@ f = V^-1 v, and twice the logarithm of its likelihood ratio to none is v^T f. Th
 x + Phi f with the covariance P + Phi V^-1 Phi^T; it needs no filter of its own.
 
 A sender's reports are also compared with its own odometry. The increment d of a report, which the odometry does not
-explain, has the covariance N that fuse_increment derives; a drift gives all increments the same mean. If their sum
-`drift` is a fault, the own error that it has caused is `drift_effect`.
+explain, has the covariance N that fuse_increment derives; a drift gives all increments the same mean.
 
 Protection levels bound the own errors with any single faulty source, at the risk `RISK`. The mixture of likely faults
 adds to P. If q is the faulty source, the error is at most |Phi f| and the quantile of the covariance without q. The
@@ -129,29 +128,6 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
 
 
 @device_function
-def correct_drift_effect(frame: BearingFrame, memory: Any, world: int, i: int, q: int):
-    """Correct the own and the calibration errors by a sender's drift, if that is a fault.
-
-    A bearing that fits, but would not fit with the drift, shows an odometry fault instead, and counts as without drift.
-    """
-    f = -(wp.transpose(memory.scratch[world, i, 0].pose.R) * memory.source[world, i, q].drift)
-    for n in range(frame.bearings):
-        if memory.measurement[world, i, n].fits == 1:
-            r = memory.derivative[world, i, n, 0].jacobian * memory.drift_effect[world, i, q - 1, 0]
-            if frame.mounting > 0:
-                r = r + memory.derivative[world, i, n, 2].jacobian * memory.drift_effect[world, i, q - 1, MOUNTING]
-            if frame.errors > 0:
-                r = r + memory.derivative[world, i, n, 3].jacobian * memory.drift_effect[world, i, q - 1, frame.errors]
-            if memory.measurement[world, i, n].source == q:
-                r = r - memory.derivative[world, i, n, 0].jacobian[:, 3:] * f
-            weighted = memory.measurement[world, i, n].weight * r
-            if wp.dot(r, weighted) < wp.float64(constants.BEARING_GATE):
-                for k in range(memory.belief[world, i].first_sender):
-                    e = wp.transpose(memory.projection[world, i, n, k]) * weighted
-                    memory.drift_effect[world, i, q - 1, k] = memory.drift_effect[world, i, q - 1, k] - e
-
-
-@device_function
 def add_to_drift(memory: Any, world: int, i: int, q: int, d: Any, N: Any):
     """Add the increment d (m, map) of a sender's report, of covariance N, to the sums of its drift."""
     W = wp.inverse(N + wp.float64(constants.MIN_VARIANCE) * wp.identity(3, wp.float64))
@@ -197,8 +173,6 @@ def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
             correct_source(frame, memory, world, i, q)
-            if is_sender(q):
-                correct_drift_effect(frame, memory, world, i, q)
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
             for c in range(1, wp.where(is_sender(q), q, 1 + SENDER_SLOTS)):

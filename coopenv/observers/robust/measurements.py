@@ -147,8 +147,18 @@ def frames_in(time: Any, period: Any):
 
 
 @device_function
+def step_since_report(model: Any, state: Any, memory: Any, world: int, i: int, tick: int, member: int):
+    """Return a member's motion by its broadcast odometry since its last fused report, and the tick of its end."""
+    last = memory.member[world, i, member].report
+    box = memory.member[world, i, member].box
+    if is_received(model, state, memory, world, i, box, tick) and memory.inbox[world, i, box].tick > last.tick:
+        return between(last.odometry, memory.inbox[world, i, box].odometry), memory.inbox[world, i, box].tick
+    return Pose(wp.identity(3, wp.float64), vec3d()), last.tick
+
+
+@device_function
 def set_measurement_of_member(
-    model: Any, memory: Any, world: int, i: int, frame: BearingFrame, member: int, received: bool, b: Any
+    model: Any, state: Any, memory: Any, world: int, i: int, frame: BearingFrame, member: int, b: Any
 ) -> bool:
     """Set the frame's next bearing as one to a member that has moved since its last fused report.
 
@@ -156,18 +166,10 @@ def set_measurement_of_member(
     twist is unknown, and the bearing is not used; the function returns whether it is. Errors that are the same in
     several frames count once in all of them.
     """
-    stands = memory.member[world, i, member].report.tick
-    box = memory.member[world, i, member].box
-    gone = vec3d()
-    turned = wp.identity(3, wp.float64)
-    variance = wp.float64(0.0)
-    if received and memory.inbox[world, i, box].tick > stands:
-        step = between(memory.member[world, i, member].report.odometry, memory.inbox[world, i, box].odometry)
-        gone = step.p
-        turned = step.R
-        passed = wp.float64(memory.inbox[world, i, box].tick - stands) * model.camera_period
-        variance = odometry_noise(model, i, passed)[1]
-        stands = memory.inbox[world, i, box].tick
+    step, stands = step_since_report(model, state, memory, world, i, frame.tick, member)
+    gone = step.p
+    passed = wp.float64(stands - memory.member[world, i, member].report.tick) * model.camera_period
+    variance = odometry_noise(model, i, passed)[1]
     age = wp.float64(frame.tick - stands) * model.camera_period - frame.age
     if age != wp.float64(0.0):
         away = wp.float64(HALF_ACCELERATION) * age * age
@@ -176,7 +178,7 @@ def set_measurement_of_member(
         if memory.member[world, i, member].has_twist == 0:
             return False
         half_turn = memory.member[world, i, member].w * (wp.float64(0.5) * age)
-        gone = gone + turned * (exp_so3(half_turn) * memory.member[world, i, member].v * age)
+        gone = gone + step.R * (exp_so3(half_turn) * memory.member[world, i, member].v * age)
         averaged = frames_in(averaging_time(model, i), frame.period)
         variance += memory.member[world, i, member].velocity_variance * age * age * averaged
     set_bearing_measurement(memory, world, i, frame.bearings, member, b, gone, variance)
@@ -185,12 +187,9 @@ def set_measurement_of_member(
 
 @device_function
 def set_measurement_of_target(
-    model: Any, state: Any, memory: Any, world: int, i: int, frame: BearingFrame, entry: int
+    model: Any, state: Any, memory: Any, world: int, i: int, frame: BearingFrame, entry: int, b: Any
 ) -> bool:
-    """Set the frame's next measurement to the bearing to a target in view; return whether it is usable."""
-    b = vec3d(body_bearing(model, state, world, i, entry))
-    if frame.searching == 1 and mounting_of(memory, world, i) > 0:
-        b = memory.member[world, i, MOUNTING].pose.R * b
+    """Set the frame's next measurement to one of an entry's target, with a bearing b; return whether it is usable."""
     target = agent_of(state, model.kept, world, i, entry)
     sender = target - model.landmarks
     if frame.searching == 1 and is_excluded(memory, world, i, slot_of(memory, world, i, target)):
@@ -199,9 +198,9 @@ def set_measurement_of_target(
         set_mapped_point(model, state, memory, world, i, frame, target)
         memory.measurement[world, i, frame.bearings].bearing = b
         return True
-    box = box_of_entry(model, entry)
-    received = is_received(model, state, memory, world, i, box, frame.tick)
     if frame.searching == 1:
+        box = box_of_entry(model, entry)
+        received = is_received(model, state, memory, world, i, box, frame.tick)
         if received:
             variance = received_variance(model, memory, world, i, box, frame)
             point = memory.inbox[world, i, box].pose.p
@@ -213,7 +212,7 @@ def set_measurement_of_target(
     q = memory.member[world, i, member].source
     if is_circular(memory, world, i, member) and not is_excluded(memory, world, i, q):
         return False
-    usable = set_measurement_of_member(model, memory, world, i, frame, member, received, b)
+    usable = set_measurement_of_member(model, state, memory, world, i, frame, member, b)
     memory.measurement[world, i, frame.bearings].source = q
     memory.source[world, i, q].seen_tick = frame.tick
     return usable
@@ -263,7 +262,10 @@ def set_bearing_measurements(model: Any, state: Any, memory: Any, world: int, i:
     for n in range(entry_count(model, state, world, i)):
         entry = entry_at(model, state, kept, world, i, n)
         if state.sight[world, i, entry] == VISIBLE:
-            if set_measurement_of_target(model, state, memory, world, i, frame, entry):
+            b = vec3d(body_bearing(model, state, world, i, entry))
+            if searching and mounting_of(memory, world, i) > 0:
+                b = memory.member[world, i, MOUNTING].pose.R * b
+            if set_measurement_of_target(model, state, memory, world, i, frame, entry, b):
                 frame.bearings += 1
     frame.jitter *= wp.float64(frame.bearings)  # it is the same for all of them
     return frame
@@ -295,7 +297,7 @@ def linearisation_variance(memory: Any, world: int, i: int, n: int, turn: Any, u
 @device_function
 def linearised_frames(memory: Any, world: int, i: int, n: int, period: Any):
     """Return how many frames have the same linearisation error of the n-th measurement."""
-    time = wp.float64(constants.LINEARISATION_TIME)
+    time = wp.float64(constants.NEWS_TIME)
     considered = memory.measurement[world, i, n].member > 0
     if considered or map_variance_of(memory, world, i, n) > wp.float64(0.0):
         time = wp.float64(constants.CONSIDERED_LINEARISATION_TIME)

@@ -298,7 +298,6 @@ def memory_struct(entries: str, of_reading: Any, name: str = "RobustMemory") -> 
         search: array("WN", Search)
         source: array("WNQ", SourceMonitor)
         sensitivity: array("WNQO", mat63d)  # of the own error and the calibration errors by the fault of a source
-        drift_effect: array("WNTO", vec6d)  # the errors themselves, if a sender's `drift` is a fault
         information: array("WNQU", mat33d)  # on a fault; and on it and that of a sender, by slot
         fault_mixture: array("WN", mat66d)  # addition of uncertain faults to the covariance of the own pose
         effect: array("WL" + entries + "Q", mat23d)  # of an innovation by the fault of a source
@@ -343,7 +342,6 @@ ROBUST_SIZES = {
     "C": MAX_CORRELATIONS,
     "Q": SOURCES,
     "D": LANDMARK_SLOTS,
-    "T": SENDER_SLOTS,
     "U": 1 + SENDER_SLOTS,
     "O": 1 + MOUNTING,
 }
@@ -427,7 +425,7 @@ def robust_rules() -> dict[str, Rule]:
     )
     large = (
         "hypothesis.cost hypothesis.misfit hypothesis.prior_distance fault_mixture sensitivity information "
-        "drift_effect source.drift source.drift_vector source.drift_information source.drift_ratio source.drift_time "
+        "source.drift source.drift_vector source.drift_information source.drift_ratio source.drift_time "
         "source.walk source.vector source.ratio source.sum source.information source.covariance source.offset "
         "source.guard.innovation source.guard.white source.guard.lasting belief.guard.time belief.guard.squared "
         "belief.guard.expected belief.guard.freedom belief.guard.factor"

@@ -20,17 +20,15 @@ from coopenv.measurements.sensor import functions_of
 from coopenv.measurements.table import KINDS
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import between, odometry_noise
-from coopenv.observers.robust.joint_state import index_of
+from coopenv.observers.robust.algebra import odometry_noise
 from coopenv.observers.robust.measurements import (
     HALF_ACCELERATION,
     frames_in,
-    is_received,
     linearised_frames,
     relative_spread,
     set_bearing_measurement,
-    set_mapped_point,
-    set_measurement_of_member,
+    set_measurement_of_target,
+    step_since_report,
 )
 from coopenv.observers.robust.memory import (
     BearingFrame,
@@ -44,10 +42,7 @@ from coopenv.observers.robust.memory import (
     vec3d,
     vec6d,
 )
-from coopenv.observers.robust.messages import is_circular
-from coopenv.observers.robust.sources import is_excluded
 from coopenv.world.model import STATIC
-from coopenv.world.nearby import box_of_entry
 from coopenv.world.warp_internals import device_function, overload_of
 
 BEARING, RANGE_BEARING, RELATIVE_POSE = ([*KINDS].index(name) for name in ("bearing", "range_bearing", "relative_pose"))
@@ -85,16 +80,11 @@ rows_of_kind = rows_in(RobustMemoryWithReadings, {number: functions_of(number) f
 
 
 @device_function
-def turn_since_report(model: Any, memory: Any, world: int, i: int, n: int, frame: BearingFrame, received: bool):
+def turn_since_report(model: Any, state: Any, memory: Any, world: int, i: int, n: int, frame: BearingFrame):
     """Set the turn of the n-th measurement's target, a member, since its last fused report; and the variance of it."""
     member = memory.measurement[world, i, n].member
-    stands = memory.member[world, i, member].report.tick
-    turn = wp.identity(3, wp.float64)
-    if received:
-        box = memory.member[world, i, member].box
-        if memory.inbox[world, i, box].tick > stands:
-            turn = between(memory.member[world, i, member].report.odometry, memory.inbox[world, i, box].odometry).R
-            stands = memory.inbox[world, i, box].tick
+    step, stands = step_since_report(model, state, memory, world, i, frame.tick, member)
+    turn = step.R
     age = wp.float64(frame.tick - stands) * model.camera_period
     away = wp.float64(HALF_ACCELERATION) * age * age
     memory.reading[world, i, n].turn = turn * exp_so3(memory.member[world, i, member].w * age)
@@ -106,25 +96,14 @@ def turn_since_report(model: Any, memory: Any, world: int, i: int, n: int, frame
 @device_function
 def set_target(model: Any, state: Any, memory: Any, world: int, i: int, frame: BearingFrame, target: int) -> bool:
     """Set the target of the frame's next measurement; return whether the measurement is usable."""
+    if not set_measurement_of_target(model, state, memory, world, i, frame, target, vec3d()):
+        return False
     n = frame.bearings
-    sender = target - model.landmarks
-    if sender < 0:
-        set_mapped_point(model, state, memory, world, i, frame, target)
+    if target < model.landmarks:
         memory.reading[world, i, n].turn = mat33d(state.rotation[world, target])
         memory.reading[world, i, n].turn_known = wp.where(model.motion.kind[target] == STATIC, 1, 0)
-        return True
-    member = index_of(memory, world, i, sender)
-    if member == 0:
-        return False
-    q = memory.member[world, i, member].source
-    if is_circular(memory, world, i, member) and not is_excluded(memory, world, i, q):
-        return False
-    received = is_received(model, state, memory, world, i, box_of_entry(model, target), frame.tick)
-    if not set_measurement_of_member(model, memory, world, i, frame, member, received, vec3d()):
-        return False
-    turn_since_report(model, memory, world, i, n, frame, received)
-    memory.measurement[world, i, n].source = q
-    memory.source[world, i, q].seen_tick = frame.tick
+    else:
+        turn_since_report(model, state, memory, world, i, n, frame)
     return True
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import errors_by_rows, forward, forward_error
+from coopenv.observers.robust.algebra import errors_by_rows, forward
 from coopenv.observers.robust.memory import (
     ERRORS,
     SENDER_SLOTS,
@@ -19,7 +19,6 @@ from coopenv.observers.robust.memory import (
     mat63d,
     mat66d,
     vec3d,
-    vec6d,
 )
 from coopenv.world.camera import VISIBLE
 from coopenv.world.warp_internals import device_function, subroutine
@@ -71,7 +70,6 @@ def clear_drift(memory: Any, world: int, i: int, q: int):
     memory.source[world, i, q].drift_ratio = wp.float64(0.0)
     memory.source[world, i, q].drift_time = wp.float64(0.0)
     memory.source[world, i, q].drift_information = mat33d()
-    fill(memory.drift_effect[world, i, q - 1], vec6d())
 
 
 @subroutine
@@ -224,6 +222,3 @@ def propagate_sources(memory: Any, world: int, i: int, step: Pose, G: Any, dt: A
                 for k in range(6):
                     Phi[k] = Phi[k] - vec3d(G[k, 0], G[k, 1], G[k, 2])
             memory.sensitivity[world, i, q, 0] = Phi
-            if is_sender(q):
-                e = forward_error(step, memory.drift_effect[world, i, q - 1, 0])
-                memory.drift_effect[world, i, q - 1, 0] = e + G * memory.drift_effect[world, i, q - 1, ERRORS]
