@@ -88,7 +88,7 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
             memory.source[world, i, q].ratio = wp.float64(0.0)
 
     @device_function
-    def no_drift(memory: Any, world: int, i: int) -> bool:
+    def no_drift(memory: Any, world: int, i: int, landmarks: int) -> bool:
         return False
 
     @device_function

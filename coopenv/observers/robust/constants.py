@@ -37,10 +37,12 @@ CONSIDERED_LINEARISATION_TIME = 12.0
 """Correlation time of the linearisation error of a bearing to another vehicle, s: no later bearing corrects it, and all
 frames of that time count as one. Tuned."""
 MAX_ACCELERATION = 1.0  # m/s^2 by which a member may leave its last known twist. Chosen: an ordinary start or stop
+MAX_SMOOTH_ACCELERATION = 10.0 * MAX_ACCELERATION  # m/s^2 and rad/s^2: largest one by brakes and steering. Chosen
 DISTANCE = 10.0  # m, of a typical target: in view, it moves as much by a turn of 0.1 rad as by a shift of 1 m
 MIN_VELOCITY_STD = 2e-3
 MIN_ANGULAR_VELOCITY_STD = MIN_VELOCITY_STD / DISTANCE
 """Least standard deviations of an odometry sample, m/s and rad/s: a moving vehicle's increments are never exact."""
+JUMP_GATE = 2.0 * float(chdtri(3, RISK))  # of the squared change of a twist between samples, in sample variances
 SHARE_OF_CHANGE = 0.2  # of a velocity, by which it must change before the effect of clock offsets is updated. Chosen
 CALIBRATION_CHANGE = 0.02
 """Change of a calibration that is no fault: of the scale of a sender's odometry, as by tyres, and of the mounting in a
@@ -68,9 +70,9 @@ anchor. Chosen: one wrong association of two does not exceed the first."""
 # Messages
 
 NEWS_TIME = 0.2
-"""Period (s) of fusing a sender's reports; reports in between contribute their odometry alone. Also the correlation
-time of the linearisation error of a bearing to a landmark, the time for which all solutions of a search must be well
-determined, and the delay after a frame in which they are not. Chosen."""
+"""Period (s) of fusing a sender's reports; reports in between contribute their odometry alone. Also the time for
+which all solutions of a search must be well determined, and the delay after a frame in which they are not. Chosen."""
+LINEARISATION_TIME = 0.5 * NEWS_TIME  # correlation time, s, of the linearisation error of a bearing to a landmark
 STEPS = int(np.iinfo(np.int8).max)  # of a correlation in a message, from 0 to 1
 MAX_CORRELATIONS = 2  # in a message, which has 256 bytes then
 VALID_TIME = MEAN_TIME + SAME_TIME

@@ -18,7 +18,6 @@ from coopenv.estimation.linalg import THIRD, block3, symmetric_part
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.correlations import (
     by_clocks,
-    correlated_tick,
     is_positive,
     rank,
     regress,
@@ -267,40 +266,16 @@ def is_pending(model: Any, state: Any, memory: Any, world: int, i: int, n: int, 
 
 
 @device_function
-def should_follow_pending(model: Any, state: Any, memory: Any, world: int, i: int, n: int, tick: int) -> bool:
-    """Return whether to fuse a report of member n after a pending one, so that broadcast correlations match reports.
-
-    The correlations of n's report refer to the pending report, or the pending report's to the previous report of n.
-    """
-    sender = memory.member[world, i, n].vehicle
-    before = memory.member[world, i, n].report.tick
-    for k in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
-        if k != n:
-            if is_pending(model, state, memory, world, i, k, tick):
-                own = correlated_tick(
-                    memory, world, i, memory.member[world, i, n].box, memory.member[world, i, k].vehicle
-                )
-                other = correlated_tick(memory, world, i, memory.member[world, i, k].box, sender)
-                if own > memory.member[world, i, k].report.tick or other == before:
-                    return True
-    return False
-
-
-@device_function
 def next_member(model: Any, state: Any, memory: Any, world: int, i: int, tick: int) -> int:
-    """Return the member whose report is fused next, 0 if there is none: leaders first, see `should_follow_pending`."""
+    """Return the member whose report is fused next, 0 if there is none: leaders before followers."""
     found = int(0)
     best = int(0)
-    waits = bool(True)
     for n in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
         if is_pending(model, state, memory, world, i, n, tick):
-            sender = memory.member[world, i, n].vehicle
-            at = rank(model, sender, memory.inbox[world, i, memory.member[world, i, n].box])
-            wait = should_follow_pending(model, state, memory, world, i, n, tick)
-            if found == 0 or (waits and not wait) or (waits == wait and at < best):
+            at = rank(model, memory.member[world, i, n].vehicle, memory.inbox[world, i, memory.member[world, i, n].box])
+            if found == 0 or at < best:
                 found = n
                 best = at
-                waits = wait
     return found
 
 

@@ -202,15 +202,6 @@ def correlation_index(memory: Any, world: int, i: int, box: int, vehicle: int) -
 
 
 @device_function
-def correlated_tick(memory: Any, world: int, i: int, box: int, vehicle: int) -> int:
-    """Return the tick of the report of a vehicle that the correlation with it in a box refers to, -1 without one."""
-    c = correlation_index(memory, world, i, box, vehicle)
-    if c < 0:
-        return -1
-    return memory.correlation[world, i, box, c].tick
-
-
-@device_function
 def matrix_of(memory: Any, world: int, i: int, box: int, c: int):
     """Return a stored correlation."""
     return mat66d(memory.correlation[world, i, box, c].matrix) * (wp.float64(1.0) / wp.float64(constants.STEPS))
@@ -223,58 +214,37 @@ def is_near(model: Any, tick: int, other: int) -> bool:
 
 
 @device_function
-def set_correlation(model: Any, memory: Any, world: int, i: int, n: int, k: int, use_reverse: bool, a: int):
+def set_correlation(model: Any, memory: Any, world: int, i: int, n: int, k: int, use_reverse: bool, a: int) -> bool:
     """Set the covariance of regressor a to the correlation of the new error of member n with that of member k.
 
-    The source is a message of n, or a message of k if `use_reverse` is set. Without either, it is the product of both
-    correlations with the third vehicle on which n and k depend most; this value is an approximation. Correlations of
-    reports too far apart in time are not used. Return whether it is known, and whether it is broadcast.
+    The source is a message of n, or a message of k if `use_reverse` is set. Correlations of reports too far apart in
+    time are not used. Return whether it is known.
     """
-    sender = memory.member[world, i, n].vehicle
-    other = memory.member[world, i, k].vehicle
     box = memory.member[world, i, n].box
-    other_box = memory.member[world, i, k].box
-    c = correlation_index(memory, world, i, box, other)
+    c = correlation_index(memory, world, i, box, memory.member[world, i, k].vehicle)
     if c >= 0:
         memory.known[world, i, a].covariance = matrix_of(memory, world, i, box, c)
-        return is_near(model, memory.correlation[world, i, box, c].tick, memory.member[world, i, k].report.tick), True
-    c = correlation_index(memory, world, i, other_box, sender)
-    if c >= 0:
-        memory.known[world, i, a].covariance = wp.transpose(matrix_of(memory, world, i, other_box, c))
-        near = is_near(model, memory.correlation[world, i, other_box, c].tick, memory.member[world, i, n].report.tick)
-        return use_reverse and near, True
-    most = wp.float64(-1.0)
-    for c in range(memory.correlation.shape[3]):
-        third = memory.correlation[world, i, box, c].vehicle
-        if third >= 0:
-            b = correlation_index(memory, world, i, other_box, third)
-            if b >= 0:
-                tick = memory.correlation[world, i, other_box, b].tick
-                if is_near(model, memory.correlation[world, i, box, c].tick, tick):
-                    X = matrix_of(memory, world, i, box, c) * wp.transpose(matrix_of(memory, world, i, other_box, b))
-                    size = wp.ddot(X, X)
-                    if size > most:
-                        most = size
-                        memory.known[world, i, a].covariance = X
-    return most >= wp.float64(0.0), False
+        return is_near(model, memory.correlation[world, i, box, c].tick, memory.member[world, i, k].report.tick)
+    box = memory.member[world, i, k].box
+    c = correlation_index(memory, world, i, box, memory.member[world, i, n].vehicle)
+    if c < 0 or not use_reverse:
+        return False
+    memory.known[world, i, a].covariance = wp.transpose(matrix_of(memory, world, i, box, c))
+    return is_near(model, memory.correlation[world, i, box, c].tick, memory.member[world, i, n].report.tick)
 
 
 @subroutine
-def note_correlations(
-    model: Any, memory: Any, world: int, i: int, n: int, received: bool, count: int, broadcast: bool
-) -> int:
-    """Store broadcast (or approximate) correlations of member n's new error; return the number of regressors.
+def note_correlations(model: Any, memory: Any, world: int, i: int, n: int, received: bool, count: int) -> int:
+    """Store broadcast correlations of member n's new error; return the number of regressors.
 
     `scratch.column` of n is the Cholesky factor of its new covariance.
     """
     for k in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
-        if k != n:
-            known, is_broadcast = set_correlation(model, memory, world, i, n, k, not received, count)
-            if known and is_broadcast == broadcast:
-                X = memory.scratch[world, i, n].column * memory.known[world, i, count].covariance
-                memory.known[world, i, count].covariance = X * wp.transpose(factor(memory.P[world, i, k, k]))
-                memory.known[world, i, count].member = k
-                count += 1
+        if k != n and set_correlation(model, memory, world, i, n, k, not received, count):
+            X = memory.scratch[world, i, n].column * memory.known[world, i, count].covariance
+            memory.known[world, i, count].covariance = X * wp.transpose(factor(memory.P[world, i, k, k]))
+            memory.known[world, i, count].member = k
+            count += 1
     return count
 
 
@@ -383,19 +353,14 @@ def regress(model: Any, memory: Any, world: int, i: int, n: int, received: bool)
     """Set `scratch.row` to the covariance of member n's new error with all errors.
 
     Its own covariance is the reported one, inflated if needed. Known are the covariance with n's previous error, if its
-    report was `received` before, the broadcast ones, and approximate ones. Approximate ones that contradict the others
-    are not used.
+    report was `received` before, and the broadcast ones.
     """
     first = wp.where(received, 1, 0)
     memory.known[world, i, 0].member = n
     memory.known[world, i, 0].covariance = stated_covariance(model, memory, world, i, n)
     memory.scratch[world, i, n].column = factor(memory.known[world, i, 0].covariance)
-    sure = note_correlations(model, memory, world, i, n, received, first, True)
-    count = note_correlations(model, memory, world, i, n, received, sure, False)
+    count = note_correlations(model, memory, world, i, n, received, first)
     solve_for(model, memory, world, i, n, count)
-    if sure > 0 and sure < count and not is_positive(memory.scratch[world, i, n].column):
-        count = sure
-        solve_for(model, memory, world, i, n, count)
     if count > first:
         memory.member[world, i, n].correlation_unknown = 0
     larger = wp.float64(1.0) + dependence_inflation(memory, world, i, n)  # the added error is the same one

@@ -30,6 +30,7 @@ from coopenv.observers.robust.memory import (
     vec3d,
     vec6d,
 )
+from coopenv.observers.robust.messages import includes
 from coopenv.observers.robust.sources import (
     CAMERA,
     FOCAL,
@@ -129,16 +130,13 @@ def exclude(memory: Any, world: int, i: int, q: int):
         add_to_calibration(memory, world, i, q)
         inflate_by_fault(memory, world, i, q)
         return
-    drift_time = wp.float64(0.0)
     if drifts(memory, world, i, q):
         memory.source[world, i, q].offset = -memory.source[world, i, q].drift
-        memory.source[world, i, q].covariance = mat33d()
-        drift_time = memory.source[world, i, q].drift_time
-    inflate_by_fault(memory, world, i, q)
+    else:
+        inflate_by_fault(memory, world, i, q)
     f = memory.source[world, i, q].offset
     clear_source(memory, world, i, q)
     memory.source[world, i, q].offset = f
-    memory.source[world, i, q].drift_time = drift_time
     memory.source[world, i, q].excluded = 1
     memory.source[world, i, q].time = wp.float64(0.0)
     k = member_of(memory, world, i, q)
@@ -158,11 +156,24 @@ def drifts(memory: Any, world: int, i: int, q: int) -> bool:
 
 
 @device_function
-def exclude_drifting(memory: Any, world: int, i: int) -> bool:
-    """Exclude all senders that drift, and return whether there are any."""
+def upstream_fault_explains_drift(memory: Any, world: int, i: int, q: int, landmarks: int) -> bool:
+    """Return whether a sender depends on another sender with a fault that would explain its drift."""
+    depends_on = memory.member[world, i, member_of(memory, world, i, q)].report.depends_on
+    for c in range(1, 1 + SENDER_SLOTS):
+        vehicle = memory.source[world, i, c].target - landmarks
+        if c != q and is_active(memory, world, i, c) and includes(depends_on, vehicle):
+            evidence = wp.max(memory.source[world, i, c].ratio, memory.source[world, i, c].drift_ratio)
+            if evidence > wp.float64(constants.ODDS):
+                return True
+    return False
+
+
+@device_function
+def exclude_drifting(memory: Any, world: int, i: int, landmarks: int) -> bool:
+    """Exclude all senders that drift, and return whether there are any; no other fault explains their drift."""
     found = bool(False)
     for q in range(1, 1 + SENDER_SLOTS):
-        if drifts(memory, world, i, q):
+        if drifts(memory, world, i, q) and not upstream_fault_explains_drift(memory, world, i, q, landmarks):
             exclude(memory, world, i, q)
             found = True
     return found
@@ -185,7 +196,7 @@ def set_fault_mixture(memory: Any, world: int, i: int, most: Any, total: Any):
 
 
 @subroutine
-def detect_and_exclude(memory: Any, world: int, i: int, time: Any):
+def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: int):
     """Weigh the hypotheses after a block of a time, s; exclude the source of one nearly certain, own sensors first.
 
     Soon after it began, a fault of the gyro looks like one of the camera: if both are likelier than none, both
@@ -210,7 +221,7 @@ def detect_and_exclude(memory: Any, world: int, i: int, time: Any):
             if not is_same(q, worst):
                 rivals += w
     certain = worst >= 0 and rivals < wp.float64(constants.FAULT_RISK)
-    if not (certain and is_own(worst)) and not lost and exclude_drifting(memory, world, i):
+    if not (certain and is_own(worst)) and not lost and exclude_drifting(memory, world, i, landmarks):
         forget_faults(memory, world, i)
         return
     if certain and (is_own(worst) or not lost):
@@ -241,8 +252,8 @@ def weight_of(ratio: Any, most: Any):
 def test_excluded(frame: BearingFrame, memory: Any, world: int, i: int, n: int, q: int):
     """Readmit an excluded source if its bearings fit well without an offset, and not with the expected offset.
 
-    The expected offset is the one at the exclusion, grown since if the source drifted.
-    Errors of the own pose are the same in many frames, so that all frames together count as one.
+    The expected offset is the one at the exclusion. Errors of the own pose are the same in many frames, so that all
+    frames together count as one.
     """
     H = -(memory.derivative[world, i, n, 0].jacobian[:, 3:] * wp.transpose(memory.member[world, i, 0].pose.R))
     W = innovation_weight(memory, world, i, n, memory.measurement[world, i, n].noise)
@@ -255,8 +266,6 @@ def test_excluded(frame: BearingFrame, memory: Any, world: int, i: int, n: int, 
     memory.source[world, i, q].sum = a
     memory.source[world, i, q].time += frame.period
     f = memory.source[world, i, q].offset
-    if memory.source[world, i, q].drift_time > wp.float64(0.0):
-        f = (wp.float64(1.0) + memory.source[world, i, q].time / memory.source[world, i, q].drift_time) * f
     least = wp.float64(constants.ROUNDING) * wp.trace(A) + wp.float64(constants.MIN_VARIANCE)
     present = wp.dot(a, wp.inverse(A + least * wp.identity(3, wp.float64)) * a)
     gain = wp.dot(f, A * f) - wp.float64(2.0) * wp.dot(f, a)

@@ -325,9 +325,21 @@ def increment_noise(model: Any, memory: Any, world: int, i: int, step: Pose, dt:
     return odometry_noise(model, i, dt) + vec2d(turning, driving)
 
 
+@wp.func
+def jump_variance(change: Any, std: Any, period: Any):
+    """Return the variance, per axis, of an increment in which the twist has changed by `change` between two samples.
+
+    A change beyond the samples' noise and a smooth acceleration is sudden, as in a collision, at any time.
+    """
+    square = wp.dot(change, change)
+    smooth = wp.float64(constants.MAX_SMOOTH_ACCELERATION)
+    gate = wp.max(wp.float64(constants.JUMP_GATE) * std * std, smooth * smooth * period * period)
+    return wp.where(square > gate, square * period * period * wp.float64(TWELFTH), wp.float64(0.0))
+
+
 @subroutine
 def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: Any):
-    """Return the increment over a tick of dt, and propagate the dead reckoning by it.
+    """Return the increment over a tick of dt and variances to add to its noise; propagate the dead reckoning.
 
     The recent mean twist is stored for `errors_transition` and `approach`. Samples are held until the next one, so that
     their sum lags by half a period. Half the change of the held sample makes it the trapezoidal rule: (v0 + v1) T / 2 =
@@ -337,10 +349,16 @@ def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: A
     w = vec3d(state.odometry_angular_velocity[world, i])
     R = orthonormalise(mat33d(state.increment_rotation[world, i]))
     p = vec3d(state.increment_translation[world, i])
+    noise = vec2d()
     if memory.belief[world, i].has_sample == 1:
+        change_v = v - memory.belief[world, i].sample_v
+        change_w = w - memory.belief[world, i].sample_w
         half = wp.float64(0.5) * model.odometry_period
-        p = p + R * (half * (v - memory.belief[world, i].sample_v))
-        R = R * exp_so3(half * (w - memory.belief[world, i].sample_w))
+        p = p + R * (half * change_v)
+        R = R * exp_so3(half * change_w)
+        period = model.odometry_period
+        noise[0] = jump_variance(change_w, wp.float64(model.noise[i].angular_velocity), period)
+        noise[1] = jump_variance(change_v, wp.float64(model.noise[i].velocity), period)
         share = dt / (dt + wp.float64(constants.MEAN_TIME))
         memory.belief[world, i].mean_v += share * (v - memory.belief[world, i].mean_v)
         memory.belief[world, i].mean_w += share * (w - memory.belief[world, i].mean_w)
@@ -352,4 +370,4 @@ def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: A
     memory.belief[world, i].sample_w = w
     step = corrected(memory, world, i, Pose(R, p), dt)
     memory.belief[world, i].odometry = moved(memory.belief[world, i].odometry, step)
-    return step
+    return step, noise

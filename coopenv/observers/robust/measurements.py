@@ -297,7 +297,7 @@ def linearisation_variance(memory: Any, world: int, i: int, n: int, turn: Any, u
 @device_function
 def linearised_frames(memory: Any, world: int, i: int, n: int, period: Any):
     """Return how many frames have the same linearisation error of the n-th measurement."""
-    time = wp.float64(constants.NEWS_TIME)
+    time = wp.float64(constants.LINEARISATION_TIME)
     considered = memory.measurement[world, i, n].member > 0
     if considered or map_variance_of(memory, world, i, n) > wp.float64(0.0):
         time = wp.float64(constants.CONSIDERED_LINEARISATION_TIME)

@@ -117,7 +117,7 @@ class SourceMonitor:
     drift_vector: vec3d  # their decaying sum, weighted by the inverse of the covariance that each has without a fault
     drift_information: mat33d  # the decaying sum of these weights
     drift_ratio: wp.float64  # like `ratio`, of a drift of the sender
-    drift_time: wp.float64  # s for which it has been likely; of an excluded source, for which it drifted, 0: it did not
+    drift_time: wp.float64  # s for which it has been likely
     time: wp.float64  # s for which it has been excluded and in view; of the velocity, since its last fault
     walk: wp.float64  # variance that the odometry's scale gains in a second, because the velocity's fault has returned
     guard: BlockSums

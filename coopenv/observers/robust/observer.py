@@ -210,7 +210,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
     if block > wp.float64(constants.SHORT_TIME - constants.SAME_TIME):
         memory.belief[world, i].block_time = wp.float64(0.0)
         if memory.search[world, i].active == 0:
-            detect_and_exclude(memory, world, i, block)
+            detect_and_exclude(memory, world, i, block, model.landmarks)
     if share >= wp.float64(0.0):
         note_rejections(model, memory, world, i, share, now)
 
@@ -309,12 +309,13 @@ def propagate_belief(model: Any, state: Any, memory: Any, world: int, i: int, no
     state.nis[world, i] = wp.float64(0.0)
     state.nis_dof[world, i] = 0
     receive_broadcast(model, state, memory, world, i)
-    step = take_odometry(model, state, memory, world, i, now.period)
+    step, jump = take_odometry(model, state, memory, world, i, now.period)
     walk_errors(model, memory, world, i, now.period)
     if memory.search[world, i].active == 1:
-        noise = increment_noise(model, memory, world, i, step, now.period, wp.float64(constants.MEAN_TIME))
+        noise = increment_noise(model, memory, world, i, step, now.period, wp.float64(constants.MEAN_TIME)) + jump
         propagate_search(memory, world, i, step, noise)
-    propagate_own(memory, world, i, step, odometry_noise(model, i, now.period), now.period)
+    noise = odometry_noise(model, i, now.period) + jump
+    propagate_own(memory, world, i, step, noise, now.period)
 
 
 @subroutine

@@ -221,7 +221,7 @@ def expected_of(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
 
     Noise beyond the camera's stands for a correlated error, multiplied by the number of frames in its correlation time.
     """
-    time = wp.float64(constants.NEWS_TIME)
+    time = wp.float64(constants.LINEARISATION_TIME)
     if memory.measurement[world, i, n].variance > wp.float64(0.0):
         time = wp.float64(constants.MEAN_TIME)
     noise = memory.measurement[world, i, n].noise
