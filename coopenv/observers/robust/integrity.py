@@ -83,6 +83,7 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
     first_sender = memory.belief[world, i].first_sender
     turn = wp.transpose(memory.scratch[world, i, 0].pose.R)
     own = memory.sensitivity[world, i, q, 0]
+    errors = memory.sensitivity[world, i, q, ERRORS]
     mounting = memory.sensitivity[world, i, q, MOUNTING]
     vector = memory.source[world, i, q].vector
     A = memory.information[world, i, q, 0]
@@ -93,7 +94,7 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
             if frame.mounting > 0:
                 M = M + memory.derivative[world, i, n, 2].jacobian * mounting
             if frame.errors > 0:
-                M = M + memory.derivative[world, i, n, 3].jacobian * memory.sensitivity[world, i, q, frame.errors]
+                M = M + memory.derivative[world, i, n, 3].jacobian * errors
             if memory.measurement[world, i, n].source == q:
                 M = M - H[:, 3:] * turn
             if q == CAMERA:
@@ -114,12 +115,12 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
             vector = vector + wp.transpose(weighted) * memory.measurement[world, i, n].innovation
             if memory.measurement[world, i, n].fits == 1:
                 own = own - wp.transpose(memory.projection[world, i, n, 0]) * WM
-                change = wp.transpose(memory.projection[world, i, n, ERRORS]) * WM
-                memory.sensitivity[world, i, q, ERRORS] = memory.sensitivity[world, i, q, ERRORS] - change
+                errors = errors - wp.transpose(memory.projection[world, i, n, ERRORS]) * WM
                 if first_sender > MOUNTING:
                     mounting = mounting - wp.transpose(memory.projection[world, i, n, MOUNTING]) * WM
     memory.source[world, i, q].vector = vector
     memory.information[world, i, q, 0] = A
+    memory.sensitivity[world, i, q, ERRORS] = errors
     memory.sensitivity[world, i, q, 0] = diagonal_by_rows(memory.scratch[world, i, 0].recentring, own)
     if first_sender > MOUNTING:
         memory.sensitivity[world, i, q, MOUNTING] = diagonal_by_rows(

@@ -9,6 +9,7 @@ from coopenv.measurements.bearing import axes_across
 from coopenv.observers.robust.algebra import by_rows
 from coopenv.observers.robust.measurements import linearisation_variance
 from coopenv.observers.robust.memory import (
+    DERIVATIVES,
     FOCAL_ERROR,
     LANDMARK_SLOTS,
     LATENCY_ERROR,
@@ -161,15 +162,10 @@ def project_on_map(memory: Any, world: int, i: int, n: int):
 def innovation_cross_covariance(memory: Any, world: int, i: int, n: int, m: int):
     """Return the covariance, 2x2, of the n-th predicted bearing with the m-th innovation, given the earlier ones."""
     S = memory.derivative[world, i, n, 0].jacobian * wp.transpose(memory.projection[world, i, m, 0])
-    member = memory.derivative[world, i, n, 1].member
-    if member > 0:
-        S = S + memory.derivative[world, i, n, 1].jacobian * wp.transpose(memory.projection[world, i, m, member])
-    mounting = memory.derivative[world, i, n, 2].member
-    if mounting > 0:
-        S = S + memory.derivative[world, i, n, 2].jacobian * wp.transpose(memory.projection[world, i, m, mounting])
-    errors = memory.derivative[world, i, n, 3].member
-    if errors > 0:
-        S = S + memory.derivative[world, i, n, 3].jacobian * wp.transpose(memory.projection[world, i, m, errors])
+    for part in range(1, DERIVATIVES):
+        k = memory.derivative[world, i, n, part].member
+        if k > 0:
+            S = S + memory.derivative[world, i, n, part].jacobian * wp.transpose(memory.projection[world, i, m, k])
     if memory.belief[world, i].map_errors == 1:
         slot = memory.measurement[world, i, n].source - 1 - SENDER_SLOTS
         if slot >= 0:
