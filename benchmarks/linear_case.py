@@ -141,15 +141,6 @@ def ancestors(links: int, broadcast: bool) -> Receiver:
     return flat(*pair, known={2: {1: float(root @ root)}} if broadcast else None)
 
 
-def two_ancestors() -> Receiver:
-    """Return a receiver of two senders with the same two ancestors: the product rule takes one of these."""
-    sources = Sources()
-    mean = 0.5 * (sources.draw(1.0) + sources.draw(1.0))
-    pair = [mean + sources.draw(SENDER_NOISE) for _ in range(2)]
-    correlation = 0.5 / np.sqrt(pair[0] @ pair[0])  # of each with one ancestor
-    return flat(*pair, known={2: {1: float(correlation**2 * (pair[0] @ pair[0]))}})
-
-
 def newcomers(count: int) -> Receiver:
     """Return a receiver that has met so many senders, one at a time, that share an ancestor two links away."""
     sources = Sources()
@@ -208,7 +199,6 @@ EXAMPLES: dict[str, Callable[[], Receiver]] = {
     "one sender, every twelfth, noisy odometry": lambda: leader(12, 0.01),
     "common ancestor, correlation known": lambda: ancestors(1, True),
     "common ancestor, correlation missing": lambda: ancestors(2, False),
-    "two common ancestors, product of one": two_ancestors,
     "four newcomers, common ancestor": lambda: newcomers(4),
     "sixteen newcomers, common ancestor": lambda: newcomers(16),
     "second encounter, limit of the order": second_encounter,

@@ -243,7 +243,6 @@ def test_the_rivals_are_observers_of_the_zoo() -> None:
         ("one sender, every twelfth, exact odometry", 1.0),
         ("common ancestor, correlation known", 1.0),
         ("common ancestor, correlation missing", (0.65 + 0.5) / 0.65),
-        ("two common ancestors, product of one", 0.6 / (0.35 + 0.125)),
         ("four newcomers, common ancestor", (4.0 + 0.3) / 1.3),
         ("sixteen newcomers, common ancestor", (16.0 + 0.3) / 1.3),
     ],
