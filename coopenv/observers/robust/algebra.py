@@ -19,14 +19,41 @@ from coopenv.estimation.linalg import (
     turn_by,
 )
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.memory import Pose, PoseEstimate, mat33d, vec2d, vec6d
 from coopenv.world.warp_internals import device_function
+
+vec2d: Any = wp.vec2d
+vec3d: Any = wp.vec3d
+vec4d: Any = wp.vec4d
+mat22d: Any = wp.mat22d
+mat33d: Any = wp.mat33d
+vec6d: Any = wp.types.vector(6, wp.float64)
+mat26d: Any = wp.types.matrix((2, 6), wp.float64)
+mat66d: Any = wp.types.matrix((6, 6), wp.float64)
+mat63d: Any = wp.types.matrix((6, 3), wp.float64)
+mat23d: Any = wp.types.matrix((2, 3), wp.float64)
+mat66f: Any = wp.types.matrix((6, 6), wp.float32)
 
 KNOWN_ANGLE_VARIANCE = constants.KNOWN_ANGLE**2
 KNOWN_POSITION_VARIANCE = constants.KNOWN_POSITION**2
 VAGUE_ANGLE_VARIANCE = constants.VAGUE_ANGLE**2
 QUARTER = 0.25 / constants.MAX_ACCELERATION**2
 BEYOND = -0.9  # cosine of an angle below which the skew part of a rotation does not determine its axis
+
+
+@wp.struct
+class Pose:
+    """Pose, body to map; or an increment of odometry, from its end to its start."""
+
+    R: mat33d
+    p: vec3d
+
+
+@wp.struct
+class PoseEstimate:
+    """A pose and its covariance."""
+
+    pose: Pose
+    P: mat66d
 
 
 @wp.func

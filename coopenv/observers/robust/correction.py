@@ -5,10 +5,10 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import by_rows, displaced, is_known, recentring, transposed_by_rows
+from coopenv.observers.robust.algebra import by_rows, displaced, is_known, mat66d, recentring, transposed_by_rows, vec6d
 from coopenv.observers.robust.joint_state import apply_corrections, set_block
 from coopenv.observers.robust.linearisation import innovation_cross_covariance, innovation_weight, linearise, project
-from coopenv.observers.robust.memory import DERIVATIVES, ERRORS, LANDMARK_SLOTS, BearingFrame, mat66d, vec6d
+from coopenv.observers.robust.memory import DERIVATIVES, ERRORS, LANDMARK_SLOTS, BearingFrame
 from coopenv.world.warp_internals import device_function, subroutine
 
 

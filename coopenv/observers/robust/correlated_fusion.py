@@ -16,6 +16,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import THIRD, block3, symmetric_part
 from coopenv.observers.robust import algebra, constants
+from coopenv.observers.robust.algebra import Pose, PoseEstimate, mat66d, vec6d
 from coopenv.observers.robust.correlations import (
     by_clocks,
     is_positive,
@@ -35,15 +36,7 @@ from coopenv.observers.robust.joint_state import (
     set_block,
 )
 from coopenv.observers.robust.measurements import is_received
-from coopenv.observers.robust.memory import (
-    LANDMARK_SLOTS,
-    SENDER_SLOTS,
-    Member,
-    Pose,
-    PoseEstimate,
-    mat66d,
-    vec6d,
-)
+from coopenv.observers.robust.memory import LANDMARK_SLOTS, SENDER_SLOTS, Member
 from coopenv.observers.robust.messages import bit_of, depends_on_own, includes, propagate_member
 from coopenv.observers.robust.sources import clear_drift, clear_source, is_excluded, is_seen, take_slot
 from coopenv.world.nearby import box_of, box_of_entry, entry_at, entry_count, sender_of

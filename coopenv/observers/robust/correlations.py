@@ -19,17 +19,8 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, cholesky6, eigen_symmetric6, exp_so3, join6, sheared, skew, symmetric_part
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.memory import (
-    Correlation,
-    Pose,
-    SenderReport,
-    fill,
-    fill_rows,
-    mat33d,
-    mat66d,
-    mat66f,
-    vec3d,
-)
+from coopenv.observers.robust.algebra import Pose, mat33d, mat66d, mat66f, vec3d
+from coopenv.observers.robust.memory import Correlation, SenderReport, fill, fill_rows
 from coopenv.observers.robust.messages import dependents, depends_on_own, own_report
 from coopenv.observers.robust.sources import guarded_covariance, is_excluded
 from coopenv.world.nearby import agent_of, box_of, box_of_entry, entry_at, entry_count, is_target

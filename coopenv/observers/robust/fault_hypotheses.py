@@ -13,23 +13,11 @@ import warp as wp
 
 from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust import constants
+from coopenv.observers.robust.algebra import mat33d, mat63d, mat66d, vec3d, vec6d
 from coopenv.observers.robust.integrity import end_block, restart_fault
 from coopenv.observers.robust.joint_state import begin_calibration, insert_member, mounting_of, remove_member, set_block
 from coopenv.observers.robust.linearisation import innovation_weight
-from coopenv.observers.robust.memory import (
-    ERRORS,
-    FOCAL_ERROR,
-    MOUNTING,
-    SENDER_SLOTS,
-    SOURCES,
-    BearingFrame,
-    fill,
-    mat33d,
-    mat63d,
-    mat66d,
-    vec3d,
-    vec6d,
-)
+from coopenv.observers.robust.memory import ERRORS, FOCAL_ERROR, MOUNTING, SENDER_SLOTS, SOURCES, BearingFrame, fill
 from coopenv.observers.robust.messages import includes
 from coopenv.observers.robust.sources import (
     CAMERA,
@@ -250,10 +238,10 @@ def weight_of(ratio: Any, most: Any):
 
 @device_function
 def test_excluded(frame: BearingFrame, memory: Any, world: int, i: int, n: int, q: int):
-    """Readmit an excluded source if its bearings fit well without an offset, and not with the expected offset.
+    """Readmit an excluded source if its bearings fit well without an offset, and not with the one at the exclusion.
 
-    The expected offset is the one at the exclusion. Errors of the own pose are the same in many frames, so that all
-    frames together count as one.
+    Only bearings that pass the gate count: a source of which some are outliers returns. Errors of the own pose are the
+    same in many frames, so that all frames together count as one.
     """
     H = -(memory.derivative[world, i, n, 0].jacobian[:, 3:] * wp.transpose(memory.member[world, i, 0].pose.R))
     W = innovation_weight(memory, world, i, n, memory.measurement[world, i, n].noise)
@@ -270,7 +258,6 @@ def test_excluded(frame: BearingFrame, memory: Any, world: int, i: int, n: int, 
     present = wp.dot(a, wp.inverse(A + least * wp.identity(3, wp.float64)) * a)
     gain = wp.dot(f, A * f) - wp.float64(2.0) * wp.dot(f, a)
     fits = present < wp.float64(constants.BEARING_GATE) and gain > wp.float64(constants.BEARING_GATE)
-    least_time = wp.float64(constants.LONG_TIME) * wp.float64(memory.source[world, i, q].exclusions)
-    if fits and memory.source[world, i, q].time > least_time:
+    if fits and memory.source[world, i, q].time > wp.float64(constants.LONG_TIME):
         memory.source[world, i, q].excluded = 0
         clear_source(memory, world, i, q)

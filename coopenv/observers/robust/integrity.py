@@ -32,20 +32,16 @@ import warp as wp
 from coopenv.estimation.linalg import block3
 from coopenv.observers.guard import LATENCY, UNKNOWN
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import KNOWN_ANGLE_VARIANCE, KNOWN_POSITION_VARIANCE, diagonal_by_rows
-from coopenv.observers.robust.memory import (
-    ERRORS,
-    FOCAL_ERROR,
-    MOUNTING,
-    SENDER_SLOTS,
-    SOURCES,
-    BearingFrame,
-    fill,
+from coopenv.observers.robust.algebra import (
+    KNOWN_ANGLE_VARIANCE,
+    KNOWN_POSITION_VARIANCE,
+    diagonal_by_rows,
     mat33d,
     vec2d,
     vec3d,
     vec6d,
 )
+from coopenv.observers.robust.memory import ERRORS, FOCAL_ERROR, MOUNTING, SENDER_SLOTS, SOURCES, BearingFrame, fill
 from coopenv.observers.robust.sources import (
     CAMERA,
     FOCAL,

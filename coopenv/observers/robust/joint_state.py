@@ -13,32 +13,26 @@ import warp as wp
 from coopenv.estimation.linalg import exp_so3, orthonormalise, skew, symmetric_part
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import (
+    Pose,
+    PoseEstimate,
     diagonal_by_rows,
     displaced,
     errors_by_rows,
     forward,
+    mat33d,
+    mat66d,
     moved,
     odometry_noise,
     propagated,
     recentred,
     recentring,
-    with_noise,
-)
-from coopenv.observers.robust.memory import (
-    ERRORS,
-    MOUNTING,
-    SENDER_SLOTS,
-    Anchor,
-    Member,
-    Pose,
-    PoseEstimate,
-    mat33d,
-    mat66d,
     vec2d,
     vec3d,
     vec4d,
     vec6d,
+    with_noise,
 )
+from coopenv.observers.robust.memory import ERRORS, MOUNTING, SENDER_SLOTS, Anchor, Member
 from coopenv.observers.robust.sources import VELOCITY, is_seen, propagate_sources
 from coopenv.world.nearby import agent_of, entry_at, entry_count
 from coopenv.world.warp_internals import device_function, subroutine

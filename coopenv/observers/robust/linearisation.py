@@ -6,7 +6,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import skew
 from coopenv.measurements.bearing import axes_across
-from coopenv.observers.robust.algebra import by_rows
+from coopenv.observers.robust.algebra import Pose, by_rows, mat26d, vec3d
 from coopenv.observers.robust.measurements import linearisation_variance
 from coopenv.observers.robust.memory import (
     DERIVATIVES,
@@ -16,9 +16,6 @@ from coopenv.observers.robust.memory import (
     SENDER_SLOTS,
     BearingFrame,
     Derivative,
-    Pose,
-    mat26d,
-    vec3d,
 )
 from coopenv.observers.robust.readings import linearise_reading
 from coopenv.world.warp_internals import device_function, subroutine

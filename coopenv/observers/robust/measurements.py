@@ -12,23 +12,17 @@ from coopenv.estimation.linalg import THIRD, block3, exp_so3
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import (
+    Pose,
     averaging_time,
     between,
     is_known,
+    mat66d,
     odometry_noise,
     position_variance,
-)
-from coopenv.observers.robust.joint_state import corrected, index_of, mounting_of, mounting_variances
-from coopenv.observers.robust.memory import (
-    ERRORS,
-    FOCAL_ERROR,
-    LATENCY_ERROR,
-    MOUNTING,
-    BearingFrame,
-    Pose,
-    mat66d,
     vec3d,
 )
+from coopenv.observers.robust.joint_state import corrected, index_of, mounting_of, mounting_variances
+from coopenv.observers.robust.memory import ERRORS, FOCAL_ERROR, LATENCY_ERROR, MOUNTING, BearingFrame
 from coopenv.observers.robust.messages import is_circular
 from coopenv.observers.robust.sources import is_excluded, slot_of, take_slot
 from coopenv.world.camera import VISIBLE, body_bearing, camera_to_body, mapped_position

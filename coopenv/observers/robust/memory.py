@@ -11,38 +11,24 @@ import warp as wp
 
 from coopenv.base.sections import LARGEST
 from coopenv.estimation.validity import are_covariances
+from coopenv.observers.robust.algebra import (
+    Pose,
+    PoseEstimate,
+    mat22d,
+    mat23d,
+    mat26d,
+    mat33d,
+    mat63d,
+    mat66d,
+    mat66f,
+    vec2d,
+    vec3d,
+    vec6d,
+)
 from coopenv.observers.robust.constants import MAX_CORRELATIONS, MAX_HYPOTHESES, MAX_MEMBERS, STEPS
 from coopenv.world.embedded import Nothing
 from coopenv.world.state import COVARIANCE, FLAG, LEAST_EIGENVALUE, ROTATION, TICK, Rule, array, numbers, whole
 from coopenv.world.warp_internals import device_function
-
-vec2d: Any = wp.vec2d
-vec3d: Any = wp.vec3d
-vec4d: Any = wp.vec4d
-mat22d: Any = wp.mat22d
-mat33d: Any = wp.mat33d
-vec6d: Any = wp.types.vector(6, wp.float64)
-mat26d: Any = wp.types.matrix((2, 6), wp.float64)
-mat66d: Any = wp.types.matrix((6, 6), wp.float64)
-mat63d: Any = wp.types.matrix((6, 3), wp.float64)
-mat23d: Any = wp.types.matrix((2, 3), wp.float64)
-mat66f: Any = wp.types.matrix((6, 6), wp.float32)
-
-
-@wp.struct
-class Pose:
-    """Pose, body to map; or an increment of odometry, from its end to its start."""
-
-    R: mat33d
-    p: vec3d
-
-
-@wp.struct
-class PoseEstimate:
-    """A pose and its covariance."""
-
-    pose: Pose
-    P: mat66d
 
 
 @wp.struct
@@ -118,7 +104,7 @@ class SourceMonitor:
     drift_information: mat33d  # the decaying sum of these weights
     drift_ratio: wp.float64  # like `ratio`, of a drift of the sender
     drift_time: wp.float64  # s for which it has been likely
-    time: wp.float64  # s for which it has been excluded and in view; of the velocity, since its last fault
+    time: wp.float64  # s for which bearings to it have fitted while excluded; of the velocity, since its last fault
     walk: wp.float64  # variance that the odometry's scale gains in a second, because the velocity's fault has returned
     guard: BlockSums
 

@@ -20,9 +20,10 @@ from coopenv.estimation.linalg import sheared, skew
 from coopenv.estimation.poses import Array, exp_so3, log_so3
 from coopenv.observers.contract import Estimate, Message, check_estimate, is_definite
 from coopenv.observers.robust import algebra, constants
+from coopenv.observers.robust.algebra import Pose, mat66f, vec3d
 from coopenv.observers.robust.constants import MAX_CORRELATIONS, MIN_VARIANCE, STEPS
 from coopenv.observers.robust.joint_state import propagate
-from coopenv.observers.robust.memory import Pose, SenderReport, mat66f, vec3d
+from coopenv.observers.robust.memory import SenderReport
 from coopenv.observers.robust.sources import guarded_covariance
 from coopenv.world.embedded import Messages
 from coopenv.world.v2x import as_broadcast, claimed_std, odometry_as_broadcast

@@ -23,6 +23,8 @@ from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import (
+    Pose,
+    PoseEstimate,
     between,
     carried,
     distance_squared,
@@ -30,7 +32,10 @@ from coopenv.observers.robust.algebra import (
     inverse_factor,
     is_known,
     is_vague,
+    mat33d,
     odometry_noise,
+    vec2d,
+    vec3d,
     with_noise,
 )
 from coopenv.observers.robust.correction import gate_is_open, iterated_update
@@ -55,17 +60,12 @@ from coopenv.observers.robust.memory import (
     ROBUST_SIZES,
     BearingFrame,
     FusedReading,
-    Pose,
-    PoseEstimate,
     RobustMemory,
     RobustMemoryWithReadings,
     Search,
     clear,
-    mat33d,
     memory_struct,
     robust_rules,
-    vec2d,
-    vec3d,
 )
 from coopenv.observers.robust.messages import ROBUST_MESSAGES, bit_of
 from coopenv.observers.robust.readings import add_readings, rows_in, rows_of_kind
@@ -108,7 +108,7 @@ def gate(frame: BearingFrame, memory: Any, world: int, i: int):
                 missed[kind] = missed[kind] + wp.float64(1.0)
                 rejected = memory.belief[world, i].rejected_sources | bit_of(1 + q)
                 memory.belief[world, i].rejected_sources = rejected
-        elif ahead and not used:
+        elif fits and not used:
             test_excluded(frame, memory, world, i, n, q)
         memory.measurement[world, i, n].fits = 0
         if used and (fits or (is_open and ahead)):

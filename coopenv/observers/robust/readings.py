@@ -20,7 +20,7 @@ from coopenv.measurements.sensor import functions_of
 from coopenv.measurements.table import KINDS
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import odometry_noise
+from coopenv.observers.robust.algebra import mat26d, mat33d, odometry_noise, vec2d, vec3d, vec6d
 from coopenv.observers.robust.measurements import (
     HALF_ACCELERATION,
     frames_in,
@@ -36,11 +36,6 @@ from coopenv.observers.robust.memory import (
     FusedReading,
     RobustMemory,
     RobustMemoryWithReadings,
-    mat26d,
-    mat33d,
-    vec2d,
-    vec3d,
-    vec6d,
 )
 from coopenv.world.model import STATIC
 from coopenv.world.warp_internals import device_function, overload_of

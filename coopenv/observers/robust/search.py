@@ -16,22 +16,22 @@ import warp as wp
 from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.p3p import camera_pose, solve_triangle
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import carried, distance_squared, inverse6, is_known, is_regular
+from coopenv.observers.robust.algebra import (
+    Pose,
+    PoseEstimate,
+    carried,
+    distance_squared,
+    inverse6,
+    is_known,
+    is_regular,
+    mat33d,
+    mat66d,
+)
 from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.joint_state import begin_belief, own_estimate, set_block
 from coopenv.observers.robust.linearisation import innovation_squared, innovation_with, linearise, tangent_basis
 from coopenv.observers.robust.measurements import frames_in, set_bearing_measurements
-from coopenv.observers.robust.memory import (
-    ERRORS,
-    MOUNTING,
-    BearingFrame,
-    Hypothesis,
-    Pose,
-    PoseEstimate,
-    Search,
-    mat33d,
-    mat66d,
-)
+from coopenv.observers.robust.memory import ERRORS, MOUNTING, BearingFrame, Hypothesis, Search
 from coopenv.world.warp_internals import device_function, subroutine
 
 PROBLEMS = 1 + 3 * 2 * 5

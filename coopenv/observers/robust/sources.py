@@ -5,21 +5,8 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import errors_by_rows, forward
-from coopenv.observers.robust.memory import (
-    ERRORS,
-    SENDER_SLOTS,
-    SOURCES,
-    BlockSums,
-    GuardTotals,
-    Pose,
-    SourceMonitor,
-    fill,
-    mat33d,
-    mat63d,
-    mat66d,
-    vec3d,
-)
+from coopenv.observers.robust.algebra import Pose, errors_by_rows, forward, mat33d, mat63d, mat66d, vec3d
+from coopenv.observers.robust.memory import ERRORS, SENDER_SLOTS, SOURCES, BlockSums, GuardTotals, SourceMonitor, fill
 from coopenv.world.camera import VISIBLE
 from coopenv.world.warp_internals import device_function, subroutine
 

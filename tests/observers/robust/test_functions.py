@@ -13,9 +13,9 @@ from scipy.linalg import eigh, expm
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers.contract import SensorNoise
+from coopenv.observers.robust.algebra import Pose as PoseRecord
 from coopenv.observers.robust.algebra import forward, inverse6, is_regular, left_error, log_so3
 from coopenv.observers.robust.correlations import excess
-from coopenv.observers.robust.memory import Pose as PoseRecord
 from tests.helpers.robust_ticks import (
     CALIBRATION,
     NOISE,
