@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from coopenv.cars.bags.turning import turn_contradiction
 from coopenv.cars.gate.wheel_command import read_drive
 from coopenv.cars.messages.codec import encode, stamp_of
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.messages.stated import Stated, stated
 from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.profile import Role
 from coopenv.cars.settings.sensors import Correction
@@ -124,8 +126,9 @@ def value_reader(
         if isinstance(value, Detections) and (others := [m for m in value.markers if m not in known]):
             unknown.update(others)
             there = [m in known for m in value.markers]
-            markers = tuple(m for m in value.markers if m in known)
-            value = replace(value, markers=markers, bearings=value.bearings[there], dropped=value.dropped + len(others))
+            markers, qualities = (tuple(compress(some, there)) for some in (value.markers, value.qualities))
+            kept: dict[str, Any] = {"markers": markers, "bearings": value.bearings[there], "qualities": qualities}
+            value = replace(value, dropped=value.dropped + len(others), **kept)
         if isinstance(value, CarPose):
             return in_frame(value, frames.get(entry.role, given.frames.map))
         if isinstance(value, Twist):
@@ -135,9 +138,14 @@ def value_reader(
     return read_value
 
 
-def _published(files: Sequence[BagFile], chosen: Collection[Chosen], given: TopicMap) -> dict[str, Calibration]:
-    """Return the first usable calibration of each car that publishes one."""
-    cars, found = {e.topic: e.car for e in chosen if e.role is Role.CAMERA_INFO}, dict[str, Calibration]()
+def _published(
+    files: Sequence[BagFile], chosen: Collection[Chosen], given: TopicMap
+) -> dict[str, tuple[Calibration, Stated]]:
+    """Return the first usable calibration of each car that publishes one, and what its message states besides."""
+    cars, found = (
+        {e.topic: e.car for e in chosen if e.role is Role.CAMERA_INFO},
+        dict[str, tuple[Calibration, Stated]](),
+    )
     for file in files:
         left, why = cars.keys() & file.topics.keys(), dict[str, str]()
         for topic, _, decode in file.messages(frozenset(left)) if left else ():
@@ -147,7 +155,7 @@ def _published(files: Sequence[BagFile], chosen: Collection[Chosen], given: Topi
                     if np.any(getattr(message, "k", getattr(message, "K", 1.0))):
                         value = read(Role.CAMERA_INFO, message, vision=given.vision)
                         if isinstance(value, Calibration):
-                            found.setdefault(cars[topic], value)
+                            found.setdefault(cars[topic], (value, stated(message)))
                         left.remove(topic)
                     else:
                         why.setdefault(topic, "")
@@ -247,7 +255,7 @@ def tracks_of(
             if stamp:
                 late = found.late if isinstance(found, Detections) else 0
                 stamp += late + round(clocks.leads.get(topic, 0.0) * NS)
-            track.entries.append(Sample(entry.car, entry.sample_role, stamp, received, found))
+            track.entries.append(Sample(entry.car, entry.sample_role, stamp, received, found, stated(message)))
         except CoopenvError as error:
             track.refused[str(error)] += 1
         except (AttributeError, TypeError, ValueError) as error:  # a definition with other fields than ours
@@ -325,6 +333,8 @@ class BagLog:
     """Detections by the number of the marker, of markers that are not in the map."""
     sent: Mapping[tuple[str, Role], tuple[Sample, ...]] = field(default_factory=dict)
     """Samples with unchanged times, by car and role."""
+    cameras: Mapping[str, Stated] = field(default_factory=dict)
+    """Contents of the CameraInfo of each car that publishes one, beside the calibration in `lenses`."""
 
 
 def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog:
@@ -346,7 +356,8 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         lenses = {name: Calibration.of(binding.scenario.cameras[vehicle]) for name, vehicle in binding.cars.items()}
         if given.vision.rectified:
             lenses = {name: replace(lens, distortion=(0.0,) * 5) for name, lens in lenses.items()}
-        lenses |= _published(files, chosen, given)  # a calibration that a car publishes replaces the environment's
+        published = _published(files, chosen, given)
+        lenses |= {car: lens for car, (lens, _) in published.items()}  # it replaces the environment's
         lenses |= {car: made.lens(lenses[car]) for car, made in given.corrections.items() if car in lenses}
         unknown = Counter[int]()
         value, mode = value_reader(given, binding, chosen, lenses, unknown), given.clocks.mode
@@ -391,7 +402,8 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         moved = (moves.get(topic, 0) + (shift.added if shift else 0)) / NS + given.clocks.leads.get(topic, 0.0)
         added.setdefault((track.chosen.car, track.chosen.role), (topic, moved))
     rows = rows_of(files, chosen, samples, clocks, tracks, leads)
-    return BagLog(samples, rows, tuple(notes), pixels, added, unknown, sent)
+    cameras = {car: about for car, (_, about) in published.items()}
+    return BagLog(samples, rows, tuple(notes), pixels, added, unknown, sent, cameras)
 
 
 def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:

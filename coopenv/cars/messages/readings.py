@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.cars.gate.wheel_command import MotionCommand
 from coopenv.cars.messages.codec import numbers_after_header
-from coopenv.cars.messages.vision import BEARINGS, FINDERS, Calibration, Tag
+from coopenv.cars.messages.detectors import BEARINGS, FINDERS
+from coopenv.cars.messages.stated import NOTHING, Stated, stated
+from coopenv.cars.messages.vision import Calibration, Quality, Tag
 from coopenv.cars.settings.profile import GATE_TYPES, MOST_CHANNELS, CarProfile, Role, VisionSettings
 from coopenv.estimation.poses import Array, log_so3
 from coopenv.observers.contract import Message
@@ -26,6 +28,7 @@ class Detections:
     bearings: Array  # (m, 3) unit vectors camera -> target, optical frame, without the lens's distortion
     dropped: int = 0  # blocks that were left out: second ones of a marker, beyond the image, not finite
     late: int = 0  # ns from the stamp to the exposure's middle
+    qualities: tuple[Quality, ...] = ()  # (m,) as the detector states them; empty: made without a detector
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +70,7 @@ class Sample:
     stamp: int  # ns, clock of the sender
     received: int  # ns, clock of the receiver
     value: Value
+    stated: Stated = NOTHING  # beside the value, untested
 
 
 PLAIN = VisionSettings()
@@ -135,7 +139,8 @@ def tags(
     units = np.array([best[number].ray for number in sorted(best)], dtype=np.float64).reshape(-1, 3)
     rows = [tag.row for tag in found if tag.row is not None]
     late = vision.late(rows, camera.image_size[1]) if camera else 0
-    return Detections(tuple(sorted(best)), units, len(found) - len(best), late)
+    numbers = sorted(best)
+    return Detections(tuple(numbers), units, len(found) - len(best), late, tuple(best[n].quality for n in numbers))
 
 
 LONGEST_MODE = 64  # characters
@@ -166,7 +171,19 @@ def calibration_of(message: Any, rectified: bool = False) -> Calibration:
         projection, bent = numbers_of(getattr(message, "p", getattr(message, "P", ())), "p", 1e6), (0.0,) * 5
         if projection.shape == (12,) and projection.any():
             focal, centre = (float(projection[0]), float(projection[5])), (float(projection[2]), float(projection[6]))
-    return Calibration(size, focal, centre, bent)
+    return _of_image(Calibration(size, focal, centre, bent), stated(message))
+
+
+def _of_image(sensor: Calibration, about: Stated) -> Calibration:
+    """Return the intrinsics of an image by those of the whole sensor, of which it has a region and bins pixels."""
+    left, top, *sides = about.region
+    width, height = sides if all(sides) else sensor.image_size
+    return Calibration(
+        (width // about.binning[0], height // about.binning[1]),
+        (sensor.focal_length[0] / about.binning[0], sensor.focal_length[1] / about.binning[1]),
+        ((sensor.principal_point[0] - left) / about.binning[0], (sensor.principal_point[1] - top) / about.binning[1]),
+        sensor.distortion,
+    )
 
 
 def state_of(message: Any) -> CarStatus:
