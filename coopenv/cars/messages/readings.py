@@ -251,10 +251,10 @@ def read(
         raise CoopenvError(f"{role}: {error}") from None
 
 
-def _twist(message: Any) -> Twist:
-    """Return the velocities of a TwistWithCovarianceStamped or Odometry; a negative variance means not measured."""
-    value = _velocities(message.twist.twist)
-    variances = np.asarray(message.twist.covariance, dtype=np.float64).reshape(6, 6).diagonal()
+def _twist(twist: Any) -> Twist:
+    """Return the velocities of a TwistWithCovariance; a negative variance means not measured."""
+    value = _velocities(twist.twist)
+    variances = np.asarray(twist.covariance, dtype=np.float64).reshape(6, 6).diagonal()
     linear, angular = (None if variances[k] < 0.0 else part for k, part in ((0, value.linear), (5, value.angular)))
     return Twist(linear, angular)
 
@@ -276,12 +276,16 @@ def _turning(message: Any) -> Twist:
     return Twist(None, numbers_of([*across, turning.z], "angular_velocity", SPINNING))
 
 
-def _pose_with_covariance(message: Any) -> CarPose:
-    """Return the pose of a PoseWithCovarianceStamped or Odometry."""
-    return replace(_placed(message.pose.pose), covariance=covariance_of(message.pose.covariance))
+def _pose_with_covariance(pose: Any) -> CarPose:
+    """Return the pose of a PoseWithCovariance."""
+    return replace(placed(pose.pose), covariance=covariance_of(pose.covariance))
 
 
-def _placed(pose: Any) -> CarPose:
+def placed(pose: Any) -> CarPose:
+    """Return the pose of a Pose or a Transform. Raises CoopenvError: it is none."""
+    if hasattr(pose, "translation"):
+        turned = rotation_of(pose.rotation, "transform.rotation")
+        return CarPose(vector(pose.translation, "transform.translation", FARTHEST), turned)
     return CarPose(vector(pose.position, "pose.position", FARTHEST), rotation_of(pose.orientation, "pose.orientation"))
 
 
@@ -289,7 +293,7 @@ def _report(message: Any) -> Message:
     """Return the message of the observer `robust`, see `coopenv.observers.robust.messages`; none: no position."""
     if not message.valid:
         return Message()
-    pose, odometry = _placed(message.pose), message.odometry
+    pose, odometry = placed(message.pose), message.odometry
     moved = vector(odometry.position, "odometry.position", FARTHEST)
     turned = log_so3(rotation_of(odometry.orientation, "odometry.orientation"))
     extra: dict[str, Any] = {
@@ -305,15 +309,22 @@ def _report(message: Any) -> Message:
 
 
 POSES: dict[str, Callable[[Any], Value]] = {
-    "geometry_msgs/msg/PoseStamped": lambda message: _placed(message.pose),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_with_covariance,
-    "nav_msgs/msg/Odometry": _pose_with_covariance,
+    "geometry_msgs/msg/PoseStamped": lambda message: placed(message.pose),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: _pose_with_covariance(message.pose),
+    "nav_msgs/msg/Odometry": lambda message: _pose_with_covariance(message.pose),
+    "geometry_msgs/msg/TransformStamped": lambda message: placed(message.transform),
+    "geometry_msgs/msg/Pose": placed,
+    "geometry_msgs/msg/PoseWithCovariance": _pose_with_covariance,
 }
 TWISTS: dict[str, Callable[[Any], Value]] = {
-    "geometry_msgs/msg/TwistWithCovarianceStamped": _twist,
+    "geometry_msgs/msg/TwistWithCovarianceStamped": lambda message: _twist(message.twist),
     "geometry_msgs/msg/TwistStamped": lambda message: _velocities(message.twist),
-    "nav_msgs/msg/Odometry": _twist,  # in the child frame
+    "nav_msgs/msg/Odometry": lambda message: _twist(message.twist),  # in the child frame
+    "geometry_msgs/msg/Twist": _velocities,
+    "geometry_msgs/msg/TwistWithCovariance": _twist,
 }
+UNSTAMPED = tuple(f"geometry_msgs/msg/{name}{more}" for name in ("Pose", "Twist") for more in ("", "WithCovariance"))
+"""Types without a stamp: in bags the time of reception counts, live cars need stamps."""
 READERS: dict[Role, dict[str, Callable[..., Value]]] = {
     Role.DETECTIONS: {kind: tags for kind in FINDERS if kind != BEARINGS},
     Role.BEARINGS: {BEARINGS: tags},
@@ -340,6 +351,8 @@ def check_types(profile: CarProfile, where: str) -> None:
     for role, readers in READERS.items():
         if (kind := profile.topics[role].type) not in readers:
             raise CoopenvError(f"{where}: profile: topics.{role}.type: {kind} is none of {listed(list(readers))}")
+        if kind in UNSTAMPED:
+            raise CoopenvError(f"{where}: profile: topics.{role}.type: {kind} has no stamp, messages of cars need one")
     kind, written = profile.topics[Role.MANUAL].type, [kind for kind, _ in profile.command.neutral.values()]
     if (numbers := numbers_after_header(kind)) != written:
         has = f"has {listed(numbers)} after its header" if numbers else "is no stamped message of numbers"
