@@ -422,7 +422,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         added.setdefault((track.chosen.car, track.chosen.role), (topic, moved))
     rows = rows_of(files, chosen, samples, clocks, tracks, leads)
     stating = {car: about for car, (_, about) in published.items()}
-    return BagLog(samples, rows, tuple(notes), pixels, added, unknown, sent, stating)
+    return BagLog(samples, rows, tuple(notes), pixels, added, unknown, sent, cameras=stating)
 
 
 def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:

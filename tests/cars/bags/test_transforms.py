@@ -69,9 +69,11 @@ def write(path: Path, given: Iterable[Row], form: str = "mcap") -> Path:
     connections: dict[str, Any] = {}
     with opened as bag:
         for topic, kind, t, message in sorted(given, key=lambda row: row[2]):
-            if topic not in connections and store is codec.ros1():  # of Noetic rosbags has not all types
-                text, digest = codec.ros2().generate_msgdef(kind, ros_version=1)
-                connections[topic] = bag.add_connection(topic, kind, msgdef=text, md5sum=digest)
+            if topic not in connections and kind == TREE and store is codec.ros1():  # which has not this type
+                one = "geometry_msgs/TransformStamped"
+                text, _ = store.generate_msgdef("geometry_msgs/msg/TransformStamped", ros_version=1)
+                text = f"{one}[] transforms\n{'=' * 80}\nMSG: {one}\n{text}"
+                connections[topic] = bag.add_connection(topic, kind, msgdef=text, md5sum="0" * 32)
             elif topic not in connections:
                 connections[topic] = bag.add_connection(topic, kind, typestore=store)
             payload = codec.encode(message)
