@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, listed
-from coopenv.cars.backend.binding import Binding
+from coopenv.cars.backend.binding import Binding, check_calibrated
 from coopenv.cars.bags.clocks import Delay, Leads, checked, jumps, leads_of, moves_of
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TRUTH, Chosen, ClockSettings, MapFrame, TopicMap, select
@@ -33,6 +33,7 @@ from coopenv.cars.bags.transforms import StaticTree, odd_mountings, unread_truth
 from coopenv.cars.bags.turning import turn_contradiction
 from coopenv.cars.gate.wheel_command import read_drive
 from coopenv.cars.messages.codec import encode, stamp_of
+from coopenv.cars.messages.detectors import PLACED
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist, Value, read
 from coopenv.cars.messages.stated import Stated, stated
 from coopenv.cars.messages.vision import Calibration
@@ -366,12 +367,16 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         files = [stack.enter_context(BagFile(path)) for path in paths]
         topics = {name: kind for file in files for name, kind in file.topics.items()}
         chosen = select(given, topics, where)
-        lenses = {name: Calibration.of(binding.scenario.cameras[vehicle]) for name, vehicle in binding.cars.items()}
+        cameras = {car: binding.scenario.cameras[vehicle] for car, vehicle in binding.cars.items()}
+        lenses = {car: Calibration.of(camera) for car, camera in cameras.items() if camera.model == "pinhole"}
         if given.vision.rectified:
             lenses = {name: replace(lens, distortion=(0.0,) * 5) for name, lens in lenses.items()}
         published = _published(files, chosen, given)
         lenses |= {car: lens for car, (lens, _) in published.items()}  # it replaces the environment's
         lenses |= {car: made.lens(lenses[car]) for car, made in given.corrections.items() if car in lenses}
+        placed = {e.car for e in chosen if e.role is Role.DETECTIONS and topics[e.topic] in PLACED}
+        for car in binding.cars.keys() - lenses.keys() - placed:
+            check_calibrated(binding.scenario, binding.cars[car], given.path.name)
         unknown = Counter[int]()
         value, mode = value_reader(given, binding, chosen, lenses, unknown), given.clocks.mode
         tree = StaticTree.of(files)
@@ -406,10 +411,9 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     ):
         notes.append(f"turn rates of {listed(cars)} are the wheels'; unread: {listed(unread)}, of type {IMU}")
     frames = {s.car: s.stated.frame for s in samples if s.role is Role.DETECTIONS and s.stated.frame}
-    cameras = {car: binding.scenario.cameras[vehicle] for car, vehicle in binding.cars.items()}
     mountings = odd_mountings(tree, frames, {car.name: car.names["body"] for car in given.cars}, cameras)
     notes += [*_turn_notes(samples, chosen, binding), *elsewhere, *mountings]
-    rays = {entry.car for entry in chosen if entry.role is Role.BEARINGS and not given.distorted}
+    rays = placed | {entry.car for entry in chosen if entry.role is Role.BEARINGS and not given.distorted}
     pixels = {name: lens for name, lens in lenses.items() if name not in rays}
     added: dict[tuple[str, Role], tuple[str, float]] = {}
     sent = {

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.cars.gate.wheel_command import MotionCommand
 from coopenv.cars.messages.codec import numbers_after_header
-from coopenv.cars.messages.detectors import BEARINGS, FINDERS
+from coopenv.cars.messages.detectors import BEARINGS, FINDERS, PLACED
 from coopenv.cars.messages.stated import NOTHING, Stated, stated
 from coopenv.cars.messages.vision import Calibration, Quality, Tag
 from coopenv.cars.settings.profile import GATE_TYPES, MOST_CHANNELS, CarProfile, Role, VisionSettings
@@ -242,7 +242,7 @@ def read(
             return calibration_of(message, vision.rectified)
         if role not in (Role.DETECTIONS, Role.BEARINGS):
             return readers[kind](message)
-        needed = role is Role.DETECTIONS or distorted
+        needed = kind not in PLACED and (role is Role.DETECTIONS or distorted)
         if needed and calibration is None:
             raise CoopenvError("the camera's calibration is not known")
         settings = vision if role is Role.DETECTIONS else PLAIN  # bearings have their final stamps
