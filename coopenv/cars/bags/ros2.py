@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from coopenv.base.errors import DataWarning, listed
+from coopenv.base.errors import CoopenvError, DataWarning, listed
 from coopenv.base.files import replacing_folder, writing
 from coopenv.cars.backend.binding import marker_places
 from coopenv.cars.bags.files import METADATA, check_extra
@@ -23,7 +23,8 @@ from coopenv.cars.messages.codec import encode, header, make, pose, ros2
 from coopenv.cars.settings.profile import TRANSFORMS
 from coopenv.estimation.poses import Array, covariance_in_map, exp_so3, exp_translation, log_so3
 from coopenv.observers.recording import Recording
-from coopenv.observers.runner import Run
+from coopenv.observers.registry import named
+from coopenv.observers.runner import Run, run
 from coopenv.observers.sensed import Truth
 from coopenv.scenario import Scenario
 from coopenv.scenario.own_terms import without_own_terms
@@ -46,6 +47,18 @@ class Sent(NamedTuple):
     time: int  # ns since 1970, of stamp and reception
     topic: str
     message: Any
+
+
+def export_bag(recording: Recording, folder: Path, observer: str | None) -> None:
+    """Write a recording as a bag with the estimates of an observer, by name; None: without.
+
+    Raises:
+        CoopenvError: no such observer, or it fails, or the folder cannot be written.
+    """
+    estimates = None if observer is None else run(named(observer), recording)
+    if estimates is not None and estimates.failure:
+        raise CoopenvError(f"{estimates.failure}; --no-scene writes the bag without estimates")
+    write_bag(recording, folder, estimates)
 
 
 def write_bag(recording: Recording, folder: str | Path, estimates: Run | None = None) -> None:
@@ -90,7 +103,7 @@ def _latched() -> Any:
     """Return the quality of service of static transforms: nodes that begin later get them, too."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
-    ever = QosTime(2_147_483_647, 4_294_967_295)
+    ever = QosTime(9_223_372_036, 854_775_807)  # the largest number of ns
     kept = QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL
     return Qos(*kept, ever, ever, QosLiveliness.AUTOMATIC, ever, False)
 
