@@ -5,5 +5,5 @@ import warnings
 from importlib import import_module
 
 warnings.warn("coopenv.backends is now coopenv.sources", DeprecationWarning, stacklevel=2)
-for _name in ("", ".base", ".cosimulation", ".highway", ".mcap"):
+for _name in ("", ".base", ".cosimulation", ".mcap"):
     sys.modules[f"coopenv.backends{_name}"] = import_module(f"coopenv.sources{_name}")

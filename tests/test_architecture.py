@@ -30,7 +30,7 @@ ROOMS = (
     ("bench",),
     ("cli", "__init__"),
     ("foxglove",),
-    ("sumo",),
+    ("sumo", "highway"),
     ("mrclam",),
     ("cars",),
     ("__main__",),
@@ -86,7 +86,7 @@ def test_imports_point_downwards(imports: dict[str, set[str]]) -> None:
     assert not upwards, upwards
 
 
-GUESTS = ("cars", "foxglove", "mrclam", "sumo")
+GUESTS = ("cars", "foxglove", "highway", "mrclam", "sumo")
 """Rooms that come in through entry points of `pyproject.toml` alone."""
 
 

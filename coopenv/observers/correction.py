@@ -139,11 +139,6 @@ def iterated(P: Array, look: Look, bend: Callable[[Array], float]) -> tuple[Arra
     return at, joseph(P, K, H, N), nis, len(N)
 
 
-CURVATURE_TIME = 12.0
-"""Time, s, in which all frames have the same second-order error. Tuned by `benchmarks.kinds` with ranges alone: with 0,
-2, 12 and 30 s ANEES of `schmidt_kalman` is 2.0, 1.4, 1.0 and 0.8, and RMSE over the bound 1.3, 1.1, 1.1 and 1.1."""
-
-
 def curvature(G: Array, angle: NDArray[np.bool_], line: Array, V: Array, frames: Array) -> Array:
     """Return the variances (m, r) of second-order errors that are the same in several frames.
 

@@ -17,8 +17,9 @@ import numpy as np
 
 from coopenv.estimation.compiled import cross_matrix, exp_so3, right_jacobian
 from coopenv.estimation.poses import Array, log_so3
+from coopenv.measurements.sensor import CURVATURE_TIME
 from coopenv.observers.contract import Setup, Tick
-from coopenv.observers.correction import BY_POSE, BY_ROW, BY_TIME, BY_VALUE, CURVATURE_TIME
+from coopenv.observers.correction import BY_POSE, BY_ROW, BY_TIME, BY_VALUE
 from coopenv.observers.frame import CAMERA
 from coopenv.observers.linearisation import LinearMeasurements
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled, exp_so3, exp_translation, transformed
 from coopenv.estimation.poses import Array, cholesky, lengths, solve
+from coopenv.measurements.sensor import CURVATURE_TIME
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.correction import (
-    CURVATURE_TIME,
     NO_CONSTANTS,
     NO_CROSSES,
     NO_PLACES,

@@ -49,7 +49,7 @@ class Highway(Cosimulator):
     """Roads, traffic (IDM and MOBIL) and dynamics of an environment of highway-env, see docs/highway.md."""
 
     title = "highway-env"
-    program = "coopenv.sources.highway:Simulation"
+    program = "coopenv.highway.program:Simulation"
     reference_midway = True
 
     id: Annotated[str, Field(max_length=64, pattern=r"^[a-z0-9][A-Za-z0-9-]*-v\d+$")]

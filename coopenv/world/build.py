@@ -11,7 +11,7 @@ from coopenv.base.errors import ScenarioError
 from coopenv.base.sections import Section
 from coopenv.estimation import KINDS, Outcome
 from coopenv.estimation.lens import largest_radius
-from coopenv.measurements.sensor import averaged_std
+from coopenv.measurements.sensor import CURVATURE_TIME, averaged_std
 from coopenv.motions.table import DRIVES, MOTIONS, columns_of
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Vehicle
@@ -141,6 +141,7 @@ def camera_entries(c: Camera, noise: Noise, rates: Rates) -> dict[str, Any]:
         "latency_std": on * c.latency_error,
         "latency_jitter": on * c.latency_jitter,
         "latency_ticks": round(c.latency / (1.0 / rates.camera)),
+        "uncertain": noise.enabled and (c.is_late or c.extrinsics_walk > 0.0 or noise.bearing.correlated.std > 0.0),
     }
 
 
@@ -161,6 +162,7 @@ def noise_entries(n: Noise, rates: Rates) -> dict[str, Any]:
         "bearing_correlated": correlated,
         "bearing_correlation_time": time,
         "bearing_counted": averaged_std(np.zeros(()), correlated, time, 1.0 / rates.camera),
+        "frames_together": max(CURVATURE_TIME * rates.camera, 1.0),
         "axis": np.column_stack([first, np.cross(axis, first), axis]),
         "lasting": n.enabled and n.lasts,
         "odometry_scale": on * n.odometry_scale,

@@ -245,6 +245,7 @@ def model_struct(p: Precision) -> Any:
         latency_jitter: scalar  # s, of one drawn for every frame
         latency_ticks: wp.int32  # nearest to `latency`
         changes: wp.int32  # 1: frames have an age, or `rotation` walks
+        uncertain: wp.int32  # 1: bearings have more noise than white noise, see `coopenv.world.quality.white_share`
 
     @wp.struct
     class NoiseValues:
@@ -257,6 +258,7 @@ def model_struct(p: Precision) -> Any:
         bearing_correlated: scalar  # rad, standard deviation of a Gauss-Markov process
         bearing_correlation_time: scalar  # s, of that
         bearing_counted: scalar  # rad, standard deviation of white noise by which filters count that
+        frames_together: scalar  # frames in the time within which a lasting error of frames counts as one
         axis: mat33  # columns: image-plane axes and optical axis of the paper's formula, camera frame
         lasting: wp.int32  # 1: any of the errors below is on
         odometry_scale: scalar

@@ -6,6 +6,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, cholesky6, identity3, join6, quaternion_vector, skew, smallest_eigenvalue6
 from coopenv.estimation.poses import Coordinates
+from coopenv.measurements.sensor import CURVATURE_TIME
 from coopenv.world.camera import VISIBLE, body_bearing, mapped_position
 from coopenv.world.nearby import agent_of, box_of_entry, entry_at, entry_count
 from coopenv.world.v2x import fresh
@@ -102,6 +103,34 @@ def known_position(model: Any, state: Any, world: int, vehicle: int, entry: int,
     return state.inbox_position[world, vehicle, box] + R * model.scene.marker[target]
 
 
+LASTING = wp.constant(CURVATURE_TIME)  # s
+
+
+@device_function
+def white_share(model: Any, state: Any, world: int, vehicle: int, target: int, R: Any, b: Any, line: Any):
+    """Return which share of the variance of a bearing's error is white noise: so much its information counts.
+
+    The rest is what the scenario declares: noise that is correlated, latency, a mounting that walks and the accuracy of
+    the map. An error that lasts counts by the number of frames that have it, as in filters without a state for it. R is
+    body to map, b the unit bearing and `line` the way (m) to the target, both in map axes, all as estimated.
+    """
+    camera = model.camera[vehicle]
+    noise = model.noise[vehicle]
+    white = noise.bearing * noise.bearing
+    o = white - white
+    if white <= o or (camera.uncertain == 0 and model.map_errors == 0):
+        return b.dtype(1.0)
+    nearness = b.dtype(1.0) / wp.max(wp.length_sq(line), b.dtype(1.0e-6))
+    about_target = wp.sqrt(nearness) * wp.cross(b, R * state.odometry_velocity[world, vehicle])
+    rate = wp.length_sq(wp.cross(R * state.odometry_angular_velocity[world, vehicle] + about_target, b))
+    lasting = camera.latency_std * camera.latency_std * rate
+    lasting += b.dtype(LASTING) * camera.orientation_walk * camera.orientation_walk
+    if target < model.landmarks:
+        lasting += model.landmark_std[target] * model.landmark_std[target] * nearness
+    other = noise.bearing_counted * noise.bearing_counted + camera.latency_jitter * camera.latency_jitter * rate
+    return white / (white + other + noise.frames_together * lasting)
+
+
 @device_function
 def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: int, block: int, dt: Any):
     """Add C^T C dt, dt being the time (or the distance) since the last sample, to a block of the sliding Gramian.
@@ -123,9 +152,10 @@ def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: i
             b = R * body_bearing(model, state, world, vehicle, entry)
             z = known_position(model, state, world, vehicle, entry, target)
             m = wp.cross(z, b)
-            G11 += dt * (wp.dot(z, z) * i3 - wp.outer(z, z) - wp.outer(m, m))
-            G12 += dt * (skew(z) - wp.outer(m, b))
-            G22 += dt * (i3 - wp.outer(b, b))
+            weight = dt * white_share(model, state, world, vehicle, target, R, b, z - R * p)
+            G11 += weight * (wp.dot(z, z) * i3 - wp.outer(z, z) - wp.outer(m, m))
+            G12 += weight * (skew(z) - wp.outer(m, b))
+            G22 += weight * (i3 - wp.outer(b, b))
     for sensor in range(state.information_11.shape[2]):
         G11 += dt * state.information_11[world, vehicle, sensor]
         G12 += dt * state.information_12[world, vehicle, sensor]

@@ -71,8 +71,8 @@ def sensor_entries(section: SensorSection, scenario: Scenario) -> dict[str, Any]
 
 def _weights(section: SensorSection, scenario: Scenario) -> Array:
     """Return the squares (6,) of the ratios of the error of a camera's bearing, rad, to those of the rows."""
-    bearing = scenario.noise.bearing.scale or Bearing.noise[0]
-    return np.pad(np.square(bearing / section.white), (0, MOST_ROWS - len(section.white)))
+    bearing, counted = scenario.noise.bearing.scale or Bearing.noise[0], section.counted(scenario.rates.camera)
+    return np.pad(np.square(bearing / counted), (0, MOST_ROWS - len(counted)))
 
 
 def sensor_tables(scenario: Scenario) -> dict[str, Any]:

@@ -16,9 +16,9 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.seeds import checked_seed
 from coopenv.estimation import Sight
 from coopenv.estimation.poses import Array, position_covariance
+from coopenv.highway.program import flipped, poses_of
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.sources.cosimulation import Cosimulated, Moment, Poses, TrafficProgram
-from coopenv.sources.highway import flipped, poses_of
 
 LONGEST = 3600.0  # s, of an episode
 

@@ -346,3 +346,41 @@ def test_a_bearing_counts_in_the_gramian_as_one_of_the_camera() -> None:
         world.advance(6)
     for name in ("gramian_11", "gramian_12", "gramian_22", "gramian_time"):
         assert_allclose(by_sensor.view(name), by_camera.view(name), atol=2e-3, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("declared", "variance"),
+    [
+        ({"bearing": {"correlated": {"std": 0.02, "time": 0.5}}}, lambda d, rate: 4e-4 * averaged_over(0.5)),
+        ({"camera": {"latency_jitter": 0.05}}, lambda d, rate: (0.05 * rate) ** 2),
+        ({"camera": {"latency_error": 0.05}}, lambda d, rate: 720.0 * (0.05 * rate) ** 2),
+        ({"camera": {"extrinsics_walk": 1e-4}}, lambda d, rate: 720.0 * 12.0 * 1e-8),
+        ({"map": {"accuracy": 0.03}}, lambda d, rate: 720.0 * (0.03 / d) ** 2),
+    ],
+)
+def test_declared_errors_of_a_bearing_take_from_its_information(declared: dict[str, Any], variance: Any) -> None:
+    """The white share of the variance: errors that last count for 12 s of frames, 720 at 60 Hz."""
+    exact = {"initial_estimate": {"orientation_angle": 0.0, "position_radius": 0.0}}
+    car = vehicle((1.0, -1.0, 0.5), motion=constant([0.3, 0.0, 0.0], [0.0, 0.0, 0.2]), **exact)
+    white = {"model": "isotropic", "scale": 0.01, "rate": 60.0}
+    gramians = []
+    for more in ({}, declared):
+        noise = {"bearing": white | more.get("bearing", {}), "velocity": 0.0, "angular_velocity": 0.0}
+        sections = {name: keys for name, keys in more.items() if name != "bearing"} | {"noise": noise}
+        world = world_of(sensing(vehicles=[car], landmarks=[landmark("A", (5.0, 3.0, 1.0))], **sections))
+        world.advance(1)
+        gramians.append(world.view("gramian_22")[0, 0].sum(axis=0))
+    line = np.array([5.0, 3.0, 1.0]) - world.view("position")[0, 1]
+    distance = np.linalg.norm(line)
+    b, R = line / distance, world.view("rotation")[0, 1]
+    turn, v = R @ np.array([0.0, 0.0, 0.2]), R @ np.array([0.3, 0.0, 0.0])
+    rate = np.linalg.norm(np.cross(turn, b) + (v - (v @ b) * b) / distance)
+    share = 1e-4 / (1e-4 + variance(distance, rate))
+    assert_allclose(gramians[1], share * gramians[0], rtol=0.05)
+    assert share < 0.9
+
+
+def averaged_over(time: float) -> float:
+    """Return how much a correlated error counts in a long mean, at 60 Hz."""
+    r = np.exp(-1.0 / (60.0 * time))
+    return float((1.0 + r) / (1.0 - r))

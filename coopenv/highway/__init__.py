@@ -1,0 +1,1 @@
+"""highway-env as a co-simulator."""
