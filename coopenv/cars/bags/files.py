@@ -148,19 +148,25 @@ class BagFile:
         return {name: (stamps, received) for name, (stamps, received) in tables.items()}
 
     def _raw(self, topics: Collection[str]) -> Iterator[tuple[BagChannel, int, bytes]]:
+        from coopenv.cars.bags.reader import ReaderError, in_reader
         from coopenv.sources.mcap_container import TooLargeError
 
         wanted = {channel for channel in self.channels if channel.topic in topics}
-        parts = [part.messages(wanted) for part in self._parts] if wanted else []
+        if not wanted:
+            return
+        size = sum(part.path.stat().st_size for part in self._parts)
         try:
-            for channel, received, data in merge(*parts, key=itemgetter(1)):
+            for channel, received, data in in_reader(lambda: self._merged(wanted), size):
                 if 0 <= received < LATEST:
-                    yield channel, received, data
+                    yield channel, received, data or b""
                 else:
                     text = f"topic {channel.topic}: messages are left out that were received after 2096"
                     warnings.warn(f"{self.path}: {text}", DataWarning, stacklevel=3)
-        except TooLargeError as error:
+        except (ReaderError, TooLargeError) as error:
             raise DataError(f"{self.path}: {error}") from None
+
+    def _merged(self, wanted: Collection[BagChannel]) -> Iterator[tuple[BagChannel, int, bytes]]:
+        return merge(*(part.messages(wanted) for part in self._parts), key=itemgetter(1))
 
     def _warn(self, others: Sequence[str]) -> None:
         """Warn of parts that are damaged, and of channels that are left out because of their encoding.

@@ -34,7 +34,7 @@ from coopenv.cars.bags.turning import turn_contradiction
 from coopenv.cars.gate.wheel_command import read_drive
 from coopenv.cars.messages.codec import encode, stamp_of
 from coopenv.cars.messages.detectors import PLACED
-from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.messages.readings import OTHER_FIELDS, CarPose, Detections, Sample, Twist, Value, read
 from coopenv.cars.messages.stated import Stated, stated
 from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.profile import Role
@@ -161,7 +161,7 @@ def _published(
                         left.remove(topic)
                     else:
                         why.setdefault(topic, "")
-                except CoopenvError as error:
+                except (CoopenvError, *OTHER_FIELDS) as error:
                     why[topic] = why.get(topic) or str(error)
             if not left:
                 break
@@ -256,7 +256,7 @@ def tracks_of(
                     track.entries.append(sample)
             except CoopenvError as error:
                 track.refused[str(error)] += 1
-            except (AttributeError, TypeError, ValueError) as error:  # a definition with other fields than ours
+            except OTHER_FIELDS as error:  # of its stamp or its transforms
                 track.refused[f"{file.topics[topic]} has other fields than expected ({error})"] += 1
     for track in tracks:
         if file.dated:

@@ -11,7 +11,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError, listed, printable
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import Chosen, TopicMap
-from coopenv.cars.messages.readings import CarPose, placed
+from coopenv.cars.messages.readings import OTHER_FIELDS, CarPose, placed
 from coopenv.cars.settings.profile import TRANSFORMS, Role
 from coopenv.estimation.poses import orientation_error_deg
 from coopenv.scenario.sensing import Camera
@@ -23,8 +23,7 @@ BASE = "base_link"
 TURNED, SHIFTED = 2.0, 0.05
 """Difference of a camera's mounting from the environment's that is worth a line, deg and m."""
 
-MALFORMED = (CoopenvError, AttributeError, TypeError, ValueError)
-"""Errors of messages that are not what their type says."""
+MALFORMED = (CoopenvError, *OTHER_FIELDS)
 
 ROOT = CarPose(np.zeros(3), np.eye(3))
 

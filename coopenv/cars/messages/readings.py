@@ -206,6 +206,9 @@ def battery_of(message: Any) -> CarStatus:
     return CarStatus(battery=share)
 
 
+OTHER_FIELDS = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+"""Errors of reading a message of a bag whose definition has other fields than ours."""
+
 FARTHEST, FASTEST, SPINNING = 1e7, 200.0, 100.0
 """m, m/s and rad/s beyond which a value is no car's."""
 
@@ -249,6 +252,8 @@ def read(
         return tags(message, calibration if needed else None, known, settings)
     except CoopenvError as error:
         raise CoopenvError(f"{role}: {error}") from None
+    except OTHER_FIELDS as error:
+        raise CoopenvError(f"{role}: {kind} has other fields than expected ({error})") from None
 
 
 def _twist(twist: Any) -> Twist:
