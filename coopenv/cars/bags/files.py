@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, error_text, listed, printable
 from coopenv.base.installation import install_command
 from coopenv.cars.backend.sources import metadata_names
+from coopenv.cars.settings.profile import COMPRESSED
 from coopenv.sources.mcap_format import MAGIC, REPAIR
 
 if TYPE_CHECKING:
@@ -45,14 +46,14 @@ YEAR = 10**9 * 86_400 * 365  # ns
 class BagFile:
     """An open bag; a context manager."""
 
-    def __init__(self, path: Path) -> None:
-        """Open a bag.
+    def __init__(self, path: Path, colours: bool = False) -> None:
+        """Open a bag; compressed frames are decoded with colours or in shades of grey.
 
         Raises:
             CoopenvError: the extra is not installed.
             DataError: no such bag, none at all, or damaged beyond reading.
         """
-        self.path = path
+        self.path, self._colours = path, colours
         check_extra()
         if not path.exists():
             raise DataError(f"no such bag: {path}")
@@ -133,7 +134,7 @@ class BagFile:
         for topic, count in Counter(c.topic for c in self.channels if c.topic in topics).items():
             if count > MOST_DEFINITIONS:
                 raise DataError(f"{self.path}: {printable(topic)} has over {MOST_DEFINITIONS} types and definitions")
-        for channel, received, data in self._raw(topics):
+        for channel, received, data in self._raw(topics, frames=True):
             yield channel.topic, received, partial(decode, channel, data)
 
     def times(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
@@ -147,7 +148,8 @@ class BagFile:
         tables = {name: np.array(rows, np.int64).reshape(-1, 2).T for name, rows in ordered.items()}
         return {name: (stamps, received) for name, (stamps, received) in tables.items()}
 
-    def _raw(self, topics: Collection[str]) -> Iterator[tuple[BagChannel, int, bytes]]:
+    def _raw(self, topics: Collection[str], frames: bool = False) -> Iterator[tuple[BagChannel, int, bytes]]:
+        """Yield channel, time of reception and bytes of messages; with `frames` compressed ones as raw ones."""
         from coopenv.cars.bags.reader import ReaderError, in_reader
         from coopenv.sources.mcap_container import TooLargeError
 
@@ -156,7 +158,7 @@ class BagFile:
             return
         size = sum(part.path.stat().st_size for part in self._parts)
         try:
-            for channel, received, data in in_reader(lambda: self._merged(wanted), size):
+            for channel, received, data in in_reader(lambda: self._merged(wanted, frames), size):
                 if 0 <= received < LATEST:
                     yield channel, received, data or b""
                 else:
@@ -165,8 +167,15 @@ class BagFile:
         except (ReaderError, TooLargeError) as error:
             raise DataError(f"{self.path}: {error}") from None
 
-    def _merged(self, wanted: Collection[BagChannel]) -> Iterator[tuple[BagChannel, int, bytes]]:
-        return merge(*(part.messages(wanted) for part in self._parts), key=itemgetter(1))
+    def _merged(self, wanted: Collection[BagChannel], frames: bool) -> Iterator[tuple[BagChannel, int, bytes]]:
+        """Yield the messages of all parts, in the reader process."""
+        from coopenv.cars.bags.definitions import with_raw_frame
+
+        for channel, received, data in merge(*(part.messages(wanted) for part in self._parts), key=itemgetter(1)):
+            if frames and channel.kind == COMPRESSED:
+                yield with_raw_frame(channel, received, data, self._colours)
+            else:
+                yield channel, received, data
 
     def _warn(self, others: Sequence[str]) -> None:
         """Warn of parts that are damaged, and of channels that are left out because of their encoding.

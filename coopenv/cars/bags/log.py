@@ -364,7 +364,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     """
     where = ", ".join(str(path) for path in paths)
     with ExitStack() as stack:
-        files = [stack.enter_context(BagFile(path)) for path in paths]
+        files = [stack.enter_context(BagFile(path, bool(given.vision.colours))) for path in paths]
         topics = {name: kind for file in files for name, kind in file.topics.items()}
         chosen = select(given, topics, where)
         cameras = {car: binding.scenario.cameras[vehicle] for car, vehicle in binding.cars.items()}
