@@ -41,6 +41,7 @@ from coopenv.observers import uncertain_pose
 from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick
 from coopenv.observers.correction import InnovationGate, Stacked, gain, joseph, judged
 from coopenv.observers.frame import UsableMeasurements, measured_message, usable_measurements
+from coopenv.observers.lasting_errors import LastingErrors
 from coopenv.observers.linearisation import LinearMeasurements, linearised, spread
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, transition
 
@@ -59,6 +60,7 @@ class Centralised:
         self.landmarks = setups[0].landmarks
         self.markers = [setup.marker for setup in setups]
         self.to_marker = [adjoint(np.eye(3), -marker) for marker in self.markers]  # own left error to the marker's
+        self.lasting = [LastingErrors(setup) for setup in setups]
         self.moves = any("velocity" in sensor.kind.needs for setup in setups for sensor in setup.sensors)
 
     def reset(self, initial_poses: Sequence[tuple[Array, Array]], initial_covariances: Sequence[Array]) -> None:
@@ -67,6 +69,8 @@ class Centralised:
         self.P = np.asarray(block_diag(*initial_covariances))
         self.sent = [Message() for _ in self.poses]
         self.gates = [InnovationGate() for _ in self.poses]
+        for lasting in self.lasting:
+            lasting.reset()
 
     @staticmethod
     def block(i: int) -> slice:
@@ -104,6 +108,9 @@ class Centralised:
         reports = {self.landmarks + j: Received(self.report(j, tick), 0.0) for j, tick in enumerate(ticks)}
         due = {i: replace(tick, messages=reports) for i, tick in enumerate(ticks) if tick.due}
         found = {i: usable_measurements(tick, weighed=False) for i, tick in due.items()}
+        for i, measured in found.items():
+            if measured is not None and self.lasting[i].counts:
+                self.lasting[i].count(ticks[i], measured, *self.poses[i])
         return {i: measured for i, measured in found.items() if measured is not None}
 
     def report(self, j: int, tick: Tick) -> Message:

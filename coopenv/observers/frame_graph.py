@@ -47,6 +47,7 @@ from coopenv.observers.correction import (
     judged_frame,
 )
 from coopenv.observers.frame import CAMERA, measured_message, usable_measurements
+from coopenv.observers.lasting_errors import LastingErrors
 from coopenv.observers.linearisation import across, linearised, put_derivative
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose, increment, moved
 
@@ -64,12 +65,13 @@ STACK = types.Array(types.float64, 4, "A", readonly=True)
 
 
 class OtherFactors(NamedTuple):
-    """The measurements of one vehicle's sensors beside the camera at a frame, and bearings of a frame with an age."""
+    """The measurements of one vehicle's sensors beside the camera at a frame, or of all where some have more noise."""
 
     vehicle: int
-    tick: Tick  # without bearings, but for those of a frame with an age
+    tick: Tick  # without bearings if they are factors of their own
     ticks: tuple[Tick, ...]  # of all vehicles
     kept: NDArray[np.bool_]  # which of the usable measurements have passed the gate
+    curvature: Array  # of these, see `ENTRY`
 
 
 class FrameGraph:
@@ -116,12 +118,9 @@ class FrameGraph:
             values[first:end] = new
         self.begin[self.frames] = end
 
-    def add_others(self, vehicle: int, ticks: Sequence[Tick], kept: NDArray[np.bool_]) -> None:
-        """Add measurements (m,) of a vehicle to the last frame, see `OtherFactors`, those of a mask."""
-        tick = ticks[vehicle]
-        if not tick.bearing_age > 0.0:
-            tick = replace(tick, valid=np.zeros_like(tick.valid))
-        self.others.setdefault(self.frames - 1, []).append(OtherFactors(vehicle, tick, tuple(ticks), kept))
+    def add_others(self, vehicle: int, tick: Tick, ticks: Sequence[Tick], kept: NDArray[np.bool_], more: Array) -> None:
+        """Add measurements of a vehicle's tick to the last frame, see `OtherFactors`; `more` is their `curvature`."""
+        self.others.setdefault(self.frames - 1, []).append(OtherFactors(vehicle, tick, tuple(ticks), kept, more))
 
     def reports(self, frame: int, ticks: Sequence[Tick], P: Array | None = None) -> dict[int, Received]:
         """Return what messages of all vehicles would state of a frame, by target; P (N, 6, 6): with covariances."""
@@ -174,6 +173,7 @@ class FrameGraph:
         if measured is None or not factors.kept.any():
             return
         measured = measured.only(factors.kept)
+        measured.entries["curvature"] = factors.curvature
         pose = UncertainPose(LEFT, self.R[frame, i], self.p[frame, i], np.zeros((6, 6)))
         linear = linearised(pose, measured)
         weight = 1.0 / linear.variance
@@ -218,7 +218,9 @@ class GraphEstimator(ABC):
         R, p = (np.array(values, float) for values in zip(*initial_poses, strict=True))
         self.graph = FrameGraph(self.setups, R, p)
         self.P = np.array(initial_covariances, float)  # (N, 6, 6) at the last tick
-        self.gates = [InnovationGate() for _ in self.setups]
+        self.gates, self.lasting = [InnovationGate() for _ in self.setups], [LastingErrors(s) for s in self.setups]
+        for lasting in self.lasting:
+            lasting.reset()
         self.sent = [Message() for _ in self.setups]
         self.begin(self.P)
 
@@ -247,16 +249,19 @@ class GraphEstimator(ABC):
         reported = replace(tick, messages=graph.reports(k, ticks, self.P))
         if (measured := usable_measurements(reported)) is None:
             return
-        pose = UncertainPose(LEFT, graph.R[k, vehicle], graph.p[k, vehicle], self.P[vehicle])
-        judgement = judged_frame(*pose, measured.frame, NO_CONSTANTS, NO_CROSSES, NO_PLACES)
+        R, p, lasting = graph.R[k, vehicle], graph.p[k, vehicle], self.lasting[vehicle]
+        if lasting.counts:
+            lasting.count(tick, measured, R, p)
+        judgement = judged_frame(LEFT, R, p, self.P[vehicle], measured.frame, NO_CONSTANTS, NO_CROSSES, NO_PLACES)
         kept = self.gates[vehicle].passed(tick.time, judgement)
-        if tick.bearing_age > 0.0:
-            graph.add_others(vehicle, ticks, kept)
+        if tick.bearing_age > 0.0 or lasting.counts:
+            graph.add_others(vehicle, tick, ticks, kept, measured.entries["curvature"][kept])
             return
         bearings = measured.only(kept).of_camera()
         graph.add(vehicle, bearings.targets, bearings.bearings, bearings.positions)
         if len(measured.sensors) > 1:
-            graph.add_others(vehicle, ticks, kept[measured.entries["sensor"] != CAMERA])
+            others, blind = measured.entries["sensor"] != CAMERA, replace(tick, valid=np.zeros_like(tick.valid))
+            graph.add_others(vehicle, blind, ticks, kept[others], measured.entries["curvature"][others & kept])
 
     def broadcast(self, ticks: Sequence[Tick]) -> list[Message]:
         """Return the measurements of this tick, which every vehicle sends: odometry and bearings."""

@@ -20,8 +20,9 @@ from coopenv.estimation.poses import Array, log_so3
 from coopenv.measurements.sensor import CURVATURE_TIME
 from coopenv.observers.contract import Setup, Tick
 from coopenv.observers.correction import BY_POSE, BY_ROW, BY_TIME, BY_VALUE
-from coopenv.observers.frame import CAMERA
-from coopenv.observers.linearisation import LinearMeasurements
+from coopenv.observers.frame import CAMERA, UsableMeasurements
+from coopenv.observers.linearisation import LinearMeasurements, linearised
+from coopenv.observers.uncertain_pose import LEFT, UncertainPose
 
 PLACES = {
     "odometry_scale": slice(0, 1),
@@ -91,7 +92,7 @@ class LastingErrors:
 
     def reset(self) -> None:
         """Forget the last sample and the twist."""
-        self.before = np.zeros((2, 3))
+        self.before, self.time = np.zeros((2, 3)), -np.inf  # s, of the tick for which errors were last counted
         self.twist, self.averaged, self.passed = np.zeros(6), np.zeros(6), 0.0
 
     def noise(self, dt: float) -> Array:
@@ -138,13 +139,21 @@ class LastingErrors:
             first += rows + 1
         return np.ascontiguousarray(changed[..., self.states])
 
+    def count(self, tick: Tick, measured: UsableMeasurements, R: Array, p: Array) -> None:
+        """Add what `counted` finds to the noise of measurements, linearised at a pose, map, m."""
+        pose = UncertainPose(LEFT, R, p, np.zeros((6, 6)))
+        variances = self.counted(tick, linearised(pose, measured))
+        measured.entries["curvature"][:, : variances.shape[1]] += variances
+
     def counted(self, tick: Tick, linear: LinearMeasurements) -> Array:
         """Return variances (m, r) of rows, linearised by a left error, for a filter without states of these errors.
 
         Errors of late frames, of a mounting that walks and of the map count as noise of so many times their variance as
         frames have the same error.
         """
-        self.step(tick, np.zeros(len(self.states)))
+        if tick.time > self.time:
+            self.step(tick, np.zeros(len(self.states)))
+            self.time = tick.time
         frames, measured = max(CURVATURE_TIME / tick.dt, 1.0), linear.measured
         changed = self.by_sensor()[measured.entries["sensor"]]
         columns = linear.H @ changed[:, BY_POSE]

@@ -112,8 +112,7 @@ class Mekf(PoseObserver):
         measured = usable_measurements(tick, self.sends_covariance) if tick.due else None
         if measured is not None:
             if self.counts_errors:
-                variances = self.lasting.counted(tick, linearised(self.state._replace(kind=LEFT), measured))
-                measured.entries["curvature"][:, : variances.shape[1]] += variances
+                self.lasting.count(tick, measured, self.state.R, self.state.p)
             self.take(tick, measured)
         return self.stated.estimate(self.nis, self.nis_dof)
 

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from coopenv.measurements.sensor import CURVATURE_TIME
 from coopenv.observers import Message, Received, Recording, Tick
 from coopenv.observers.contract import SensorNoise
-from coopenv.observers.correction import CURVATURE_TIME, NO_PLACES, looked
+from coopenv.observers.correction import NO_PLACES, looked
 from coopenv.observers.frame import UsableMeasurements, usable_measurements
 from coopenv.observers.lasting_errors import LastingErrors
 from coopenv.observers.linearisation import linearised
-from coopenv.observers.pose_filters import MekfCovariance
+from coopenv.observers.registry import find
 from coopenv.observers.schmidt_kalman import SchmidtCalibrating, SchmidtKalman, complete
 from coopenv.observers.uncertain_pose import LEFT, UncertainPose
 from tests.helpers.recordings import completed
@@ -229,9 +231,16 @@ def test_other_filters_count_map_errors_as_noise_of_many_frames() -> None:
     distance = np.linalg.norm(measured.positions - pose.p, axis=1)
     expected = CURVATURE_TIME / DT * (0.2 / distance) ** 2
     assert_allclose(lasting.counted(tick, linearised(pose, measured)), np.tile(expected[:, None], 2))
-    made = replace(made, setups=(setup,))
-    wide, exact = (completed(MekfCovariance, each).covariance[-1, 0] for each in (made, straight(3, NOISE)))
-    assert np.trace(wide[3:, 3:]) > 2.0 * np.trace(exact[3:, 3:])
+
+
+@pytest.mark.parametrize("name", ["mekf_covariance", "centralised", "belief_propagation", "smoother"])
+@pytest.mark.parametrize("declared", [{"landmark_std": (0.2,) * len(MARKS)}, {"noise": replace(NOISE, latency=0.05)}])
+def test_other_filters_are_less_sure_with_declared_errors(name: str, declared: dict[str, Any]) -> None:
+    exact = straight(6, NOISE)
+    uncertain = replace(exact, setups=(replace(exact.setups[0], **declared),))
+    wide, known = (completed(find(name), each) for each in (uncertain, exact))
+    assert np.trace(wide.covariance[-1, 0, 3:, 3:]) > 2.0 * np.trace(known.covariance[-1, 0, 3:, 3:])
+    assert wide.position_error.max() < 1e-6
 
 
 def test_vehicles_with_late_frames_broadcast_their_velocity() -> None:
