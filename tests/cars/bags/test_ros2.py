@@ -210,8 +210,8 @@ def test_measurements_without_a_standard_message_are_named(tmp_path: Path) -> No
 
 
 def test_an_observer_that_fails_writes_nothing(tmp_path: Path) -> None:
-    with pytest.raises(CoopenvError, match="nobody"):
-        export_bag(recorded("crossing_path"), tmp_path / "bag", "nobody")
+    with pytest.raises(CoopenvError, match="no_such_observer"):
+        export_bag(recorded("crossing_path"), tmp_path / "bag", "no_such_observer")
     assert not (tmp_path / "bag").exists()
 
 
