@@ -1,4 +1,4 @@
-"""What messages state beside their values, untested: frames, variances, binning and region of a camera."""
+"""Context that messages state beside their values, untested: frames, variances, binning and region of a camera."""
 
 from dataclasses import dataclass
 from functools import lru_cache
