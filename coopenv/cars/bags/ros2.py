@@ -44,7 +44,7 @@ STATIC = "/tf_static"
 class Sent(NamedTuple):
     """A message of a bag."""
 
-    time: int  # ns since 1970, of stamp and reception
+    time: int  # ns since 1970, of reception; stamps are the same, but those of frames with an age
     topic: str
     message: Any
 
@@ -151,6 +151,7 @@ class _Vehicle:
         self._camera = Camera() if scenario is None else scenario.cameras[number]
         self._calibrated = scenario is not None and self._camera.model == "pinhole"
         self._to_body = self._camera.to_body()
+        self._ages = recording.filled("bearing_age")[:, number]  # s, of frames
         self._reckoned = np.eye(3), np.zeros(3)
 
     @property
@@ -164,7 +165,7 @@ class _Vehicle:
         """Yield name of the topic and message of a tick; -1 is a period before the first one."""
         r, i, time = self._recording, self._number, _time(self._recording, k)
         seen = np.flatnonzero(r.visible[k, i] & np.isfinite(r.bearings[k, i]).all(axis=-1)) if k >= 0 else ()
-        optical = header(time, f"{self.name}/camera")
+        optical = header(time - round(self._ages[max(k, 0)] * 1e9), f"{self.name}/camera")
         if k < 0 and self._calibrated:
             yield "camera_info", _camera_info(self._camera, optical)
         found = [self._marker(k, int(target), optical) for target in seen]

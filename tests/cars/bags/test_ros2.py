@@ -37,11 +37,12 @@ STARTS = ("start_rotation", "start_position", "start_covariance", "truth.positio
 ENVIRONMENTS = ("crossing_path", "svea_overtaking", "busy_intersection", "take_turns")
 """A moving landmark and a pixel camera; two cars; cameras without pixels; landmarks that are drawn."""
 SEED = 3
+PUNCTUAL = {f"camera.{name}": 0.0 for name in ("latency", "latency_error", "latency_jitter")}
 
 
 @cache
 def recorded(name: str) -> Recording:
-    return record(load_scenario(name, {"horizon": 1.0}), SEED)
+    return record(load_scenario(name, {"horizon": 1.0, **PUNCTUAL}), SEED)
 
 
 @cache
@@ -151,6 +152,14 @@ def test_estimates_have_their_covariance(tmp_path: Path) -> None:
     assert_allclose(message.pose.covariance.reshape(6, 6)[:3, :3], J @ P @ J.T, atol=1e-12)
 
 
+def test_frames_have_the_stamp_of_their_exposure(tmp_path: Path) -> None:
+    write_bag(
+        record(load_scenario("crossing_path", {"horizon": 0.2, **PUNCTUAL, "camera.latency": 0.05}), 0), tmp_path / "b"
+    )
+    rows = messages_of(tmp_path / "b")["/vehicle_1/detections"][1:]
+    assert [time - stamp_of(message) for time, message in rows] == [50_000_000] * 13
+
+
 def test_every_channel_is_cdr_and_the_metadata_are_those_of_rosbag2(folder: Path) -> None:
     from mcap.reader import make_reader
 
@@ -177,7 +186,8 @@ def test_record_and_export_write_it(tmp_path: Path, capsys: pytest.CaptureFixtur
     log, bag, other = tmp_path / "log.mcap", tmp_path / "bag", tmp_path / "log"
     write_recording(recorded("crossing_path"), log)
     assert main(["export", str(log), "--format", "ros2"]) == 0
-    line = ["record", "crossing_path", "--override", "horizon=1", "--seed", str(SEED), "--ros", "--no-replay"]
+    changes = [text for key, value in PUNCTUAL.items() for text in ("--override", f"{key}={value}")]
+    line = ["record", "crossing_path", "--override", "horizon=1", *changes, "--seed", str(SEED), "--ros", "--no-replay"]
     assert main([*line, "--out", str(bag)]) == 0
     found, again = messages_of(bag), messages_of(other)
     assert found.keys() == again.keys() and "/vehicle_1/estimate" in found
