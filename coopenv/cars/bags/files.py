@@ -111,16 +111,13 @@ class BagFile:
 
     def _unpacked(self, file: Path) -> Path:
         """Return a copy of a packed file that is unpacked, until the bag is closed. Raises TooLargeError."""
-        import zstandard
-
-        from coopenv.sources.mcap_container import Allowance
+        from coopenv.cars.bags.reader import in_reader
+        from coopenv.cars.bags.streams import blocks_of
 
         place = Path(self._stack.enter_context(tempfile.TemporaryDirectory()), file.name.removesuffix(PACKED))
-        allowance = Allowance(file.stat().st_size)
-        with file.open("rb") as packed, place.open("wb") as out:
-            for data in zstandard.ZstdDecompressor().read_to_iter(packed):
-                allowance.take(len(data))
-                out.write(data)
+        with place.open("wb") as out:
+            for _, _, block in in_reader(partial(blocks_of, file), file.stat().st_size):
+                out.write(block or b"")
         return place
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Callable[[], Any]]]:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import apsw
+import zstandard
 
 from coopenv.base.errors import regular
 from coopenv.cars.bags.definitions import ROS1, BagChannel
@@ -24,6 +25,8 @@ from coopenv.sources.mcap_format import MAGIC, is_cut_off
 ENDS_EARLY = "its end is missing"
 ZSTD = b"\x28\xb5\x2f\xfd"
 """Begin of a packed message; a message of CDR begins with 0."""
+WHOLE = BagChannel("", "", "zstd")
+"""Channel of the blocks of a packed file."""
 MOST_CHANNELS = 2**16  # as many as an MCAP file has numbers for
 EXPANSION = {".mcap": 1000, ".db3": 200, ".bag": 200}
 """Times that a bag may grow when it is unpacked: dark frames and empty maps, which no car needs, pack well."""
@@ -97,6 +100,15 @@ def _unpacked(data: bytes, allowance: Allowance) -> bytes:
         raise
     except Exception:  # any error of the library at malformed bytes
         return b""
+
+
+def blocks_of(path: Path) -> Entries:
+    """Yield the blocks of a packed file. Raises TooLargeError; other errors are the library's."""
+    allowance = Allowance(path.stat().st_size)
+    with regular(path).open("rb") as packed:
+        for block in zstandard.ZstdDecompressor().read_to_iter(packed):
+            allowance.take(len(block))
+            yield WHOLE, 0, block
 
 
 def _channel(topic: bytes, kind: bytes, encoding: str, language: str = "", definition: bytes = b"") -> BagChannel:
