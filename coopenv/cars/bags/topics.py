@@ -90,7 +90,7 @@ def proposed(files: Sequence[BagFile], rows: Sequence[TopicRow]) -> str:
     """Return a map of bags with such topics, as TOML text. Raises CoopenvError: no topic has detections of a camera."""
     cars = cars_of(rows)
     used = {name for topics in cars.values() for name in topics.values()}
-    markers = ", ".join(f"{number} ({count} frames)" for number, count in sorted(_markers(files, used).items()))
+    markers = ", ".join(f"{number} ({count} frames)" for number, count in sorted(markers_of(files, used).items()))
     none = "images ([vision]: their tags)" if any(r.type in IMAGES and r.topic in used for r in rows) else "no marker"
     lines = [
         "# Proposed by names and types of topics: check every line.",
@@ -152,7 +152,7 @@ def role_of(row: TopicRow) -> Role | None:
     return next((role for role in order if role in READ and row.type in READERS.get(role, TO_WHEELS)), None)
 
 
-def _markers(files: Sequence[BagFile], used: set[str]) -> Counter[int]:
+def markers_of(files: Sequence[BagFile], used: set[str]) -> Counter[int]:
     """Return in how many frames each marker was detected on the topics that are used. Images are not searched."""
     found: Counter[int] = Counter()
     for file in files:

@@ -160,7 +160,7 @@ def _of_vehicles(r: "Recording", scenario: Scenario, static: NDArray[np.int64], 
         known = np.flatnonzero(r.truth.known[:, i])
         place = r.truth.position[known, i]
         found = {
-            "time": r.t[tick],
+            "time": r.t[tick] - r.filled("bearing_age")[tick, i],
             "target": target,
             "wheel_time": middle,
             "wheel": (speed[:, 0] + 1j * speed[:, 1]) * np.exp(-0.5j * turn[:, 2] * r.dt),

@@ -126,9 +126,22 @@ def calibrate(
     out: Annotated[Path, typer.Option(help="Folder of calibration.toml and the figures.")] = Path("out", "calibration"),
     overrides: options.Overrides = None,
     no_truth: Annotated[bool, typer.Option("--no-truth", help="Leave out motion capture.")] = False,
+    propose: Annotated[
+        Path | None, typer.Option(help="Folder to write, without --map: environment and map, markers solved.")
+    ] = None,
+    like: Annotated[str, typer.Option(help="With --propose: environment with cameras and noise.")] = "svea_overtaking",
     as_json: options.AsJson = False,
 ) -> None:
-    """Estimate cameras, odometry, clocks and markers of cars from one drive, and print which constants are wrong."""
+    """Estimate cameras, odometry, clocks and markers of cars from one drive, and print which constants are wrong.
+
+    With --propose the places of all markers are unknown: they are solved, with motion capture or without.
+    """
+    if propose is not None:
+        if topics is not None or overrides:
+            given = "--map" if topics is not None else "--override"
+            raise CoopenvError(f"--propose: writes an environment and a map, {given} is for a map that is there")
+        _survey(bags, like, propose, not no_truth, as_json)
+        return
     from coopenv.base.files import check_file, new_folder, replace_text
     from coopenv.cars.bags.bag import open_bags
     from coopenv.cars.calibration.calibrate import calibrate as calibrated
@@ -161,6 +174,31 @@ def calibrate(
         _print_calibrated(result, files)
     if not result.explained:
         raise typer.Exit(1)
+
+
+def _survey(bags: Sequence[Path], like: str, folder: Path, truth: bool, as_json: bool) -> None:
+    """Solve markers, write the files and print a table."""
+    from coopenv.base.files import new_folder
+    from coopenv.cars.calibration.survey import survey
+    from coopenv.report.table import Table
+    from coopenv.runs.console import Progress
+
+    with new_folder(folder), Progress(options.console(stderr=True), "solving markers"):
+        result = survey(bags, like, folder, truth)
+    if as_json:
+        options.print_json({"markers": result.markers, "sightings": result.sightings, "truth": result.truth})
+        return
+    table = Table.of_texts(["marker", "is", "finding"], ["frames", "x [m]", "y [m]", "z [m]", "std. error [m]"])
+    for m in result.markers:
+        error = f"{max(m.error):.2g}" if m.error else "-"
+        place = [f"{value:.3f}" for value in m.position] or ["-"] * 3
+        table.add(str(m.number), m.name, m.finding, str(m.frames), *place, error)
+    console = options.console()
+    console.print(table)
+    if not result.truth:
+        console.print("No motion capture: the origin is the first car's start.")
+    console.print(f"Files: {', '.join(map(str, result.files))}", soft_wrap=True)
+    console.print(f"Next: coopenv run {bags[0]} --map {result.files[1]}", soft_wrap=True)
 
 
 def _print_calibrated(result: Calibrated, files: Sequence[Path]) -> None:

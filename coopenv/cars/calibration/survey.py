@@ -1,0 +1,382 @@
+"""The map from a drive: places of the markers that cameras have seen, an environment and a map of topics for them.
+
+Every marker starts where its lines of sight meet, from the poses of motion capture, or of dead reckoning without it.
+One batch least squares then estimates all places, poses and what each drive has anew; without motion capture the pose
+of the first car at the begin is the origin. A marker whose lines of sight do not meet belongs to a car, or moves.
+Source: Hartley and Sturm, Triangulation, Computer Vision and Image Understanding 68(2), 1997 (iterated linear method).
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment, minimize_scalar
+
+from coopenv.base.errors import DataError, listed
+from coopenv.base.files import replace_text
+from coopenv.cars.bags.bag import open_bags
+from coopenv.cars.bags.files import BagFile
+from coopenv.cars.bags.topics import cars_of, examined, markers_of
+from coopenv.cars.calibration.batch import BIAS, CAMERA_TIME, LATE, NUISANCE, ROT, Batch, Fit
+from coopenv.cars.calibration.calibrate import errors
+from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive, drive_of_bag
+from coopenv.cars.settings.profile import Role
+from coopenv.estimation.poses import Array
+from coopenv.scenario import load_scenario
+
+LEAST_FRAMES = 50  # in which a marker must be seen
+FITTING, MEETING = 0.8, 0.03  # share of the lines of sight that pass a marker that stands within an angle, rad
+TRIPLES = 20  # of lines of sight that meet somewhere, of which the best is the start
+ENOUGH = 100  # lines of sight to a marker, for first constants
+VAGUE = 0.1  # m, standard deviation of a place by its lines of sight, from which it is not known
+BIASES = np.linspace(-0.1, 0.1, 21)  # rad/s, gyro biases that are tried without motion capture
+OWN = 0.3  # rad, median angle between lines of sight to a marker on a car and to the car's origin
+UNKNOWN_PLACE = 10.0  # m, prior of a place
+LARGEST_ERROR = 0.02  # m, standard, of a place that is of use
+SAME = 0.3  # m, to a landmark of the environment that gives the name
+KEPT = ("rates", "camera", "noise", "map", "topology", "v2x", "observer", "dynamics")
+"""Sections of an environment that the new one takes over."""
+
+
+@dataclass(frozen=True)
+class SurveyedMarker:
+    """A marker."""
+
+    number: int
+    name: str  # of a landmark, or of the car that carries it; empty: neither
+    frames: int
+    position: tuple[float, ...] = ()  # m, map; empty: not solved
+    error: tuple[float, ...] = ()  # m, standard; empty: without motion capture
+    finding: str = ""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """The result, whose files are written."""
+
+    markers: tuple[SurveyedMarker, ...]
+    sightings: tuple[float, ...]  # standard deviation by car, px or rad
+    truth: bool
+    files: tuple[Path, Path]
+
+
+def meeting_point(origin: Array, ray: Array) -> tuple[Array, float, float]:
+    """Return the point (3,) nearest to lines from origins (n, 3), m, along unit rays, their angle to it, and its std.
+
+    Of the angles a share `FITTING` is smaller. Lines count by their angle: the distance from a line is divided by that
+    from its origin, and outliers count less.
+    """
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+
+    def meeting(weight: Array) -> tuple[Array, Array]:
+        W = weight[:, None, None] * across
+        information = W.sum(axis=0) + 1e-9 * np.eye(3)
+        return np.linalg.solve(information, (W @ origin[:, :, None]).sum(axis=0)[:, 0]), information
+
+    triples = np.linspace(0, len(ray) - 1, TRIPLES + 2).astype(int)
+    starts = [meeting(np.isin(np.arange(len(ray)), triples[k : k + 3]).astype(float))[0] for k in range(TRIPLES)]
+    point = min(starts, key=lambda start: float(np.median(angles(ray, start - origin))))
+    scale, information = 1.0, np.eye(3)
+    for _ in range(20):
+        line = point - origin
+        distance = np.maximum(np.linalg.norm(line, axis=-1), 0.1)
+        angle = angles(ray, line)
+        scale = max(float(np.median(angle)), 1e-3)
+        point, information = meeting(1.0 / (distance * (1.0 + (angle / (3.0 * scale)) ** 2)) ** 2)
+    angle = angles(ray, point - origin)
+    return point, float(np.quantile(angle, FITTING)), scale / float(np.sqrt(np.linalg.eigvalsh(information)[0]))
+
+
+def angles(ray: Array, line: Array) -> Array:
+    """Return the angles (n,) between unit rays and lines (n, 3) of any length, rad."""
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(ray, line), axis=-1), (ray * line).sum(axis=-1)))
+
+
+def lines_of_sight(car: CarDrive, place: Array, yaw: Array) -> tuple[Array, Array]:
+    """Return the cameras (n, 3), m, and unit rays (n, 3) of a car's sightings, map, by its places (complex) and yaw."""
+    R = np.zeros((len(yaw), 3, 3))
+    R[:, 0, 0] = R[:, 1, 1] = np.cos(yaw)
+    R[:, 1, 0], R[:, 0, 1], R[:, 2, 2] = np.sin(yaw), -np.sin(yaw), 1.0
+    at = np.stack([place.real, place.imag, np.full(len(yaw), car.height)], axis=-1)
+    return at + R @ car.lever, (R @ (car.ray @ car.mounting.T)[:, :, None])[..., 0]
+
+
+def first_poses(batch: Batch) -> tuple[list[Array], list[int], Array]:
+    """Return first poses (M, 3) of all cars at keyframes, the cars whose poses are known, and first constants (G,).
+
+    With motion capture it is the time of a car's sightings by which its lines of sight meet best. Without it, the first
+    car is known by dead reckoning from the origin, with the gyro bias by which they do; others are not known.
+    """
+    x = np.zeros(len(batch.kinds))
+    known = [c for c, has in enumerate(batch.truth) if has]
+    for c in known or [0]:
+        constant, tried = (batch.own(c).start + CAMERA_TIME, LATE) if known else (batch.own(c).start + BIAS, BIASES)
+
+        def missed(value: float, c: int = c, constant: int = constant) -> float:
+            x[constant] = value
+            pose = keyframe_poses(batch, c, x)
+            lines = [_seen(batch, c, x, pose, target) for target in np.unique(batch.cars[c].target)]
+            some = [[part[:: 1 + len(part) // ENOUGH] for part in line] for line in lines]
+            return float(np.median([meeting_point(origin, ray)[1] for origin, ray in some]))
+
+        best, step = min(tried.tolist(), key=missed), float(tried[1] - tried[0])
+        bounds = best - step, best + step
+        x[constant] = minimize_scalar(missed, bounds=bounds, method="bounded", options={"xatol": 0.02 * step}).x
+    return [keyframe_poses(batch, c, x) for c in range(len(batch.cars))], known or [0], x
+
+
+def keyframe_poses(batch: Batch, c: int, x: Array) -> Array:
+    """Return the poses (M, 3) of a car at the keyframes: of motion capture, or dead reckoning from the origin."""
+    car, keys = batch.cars[c], batch.keys[c]
+    if batch.truth[c]:
+        yaw = np.interp(keys, car.truth_time, np.unwrap(car.truth_yaw))
+        place = np.interp(keys, car.truth_time, car.truth)
+    else:
+        place, yaw = batch.path(c, x).step(np.full(len(keys), keys[0]), keys)
+    return np.stack([place.real, place.imag, yaw], axis=-1)
+
+
+def solved(drive: CalibrationDrive, truth: bool) -> tuple[Batch, Fit, Array, Array]:
+    """Return the batch of a drive, its fit with all markers free, places (L, 3) of markers and starts (C, 3) of cars.
+
+    The first car's sightings give the first places; without motion capture other cars are found by these.
+    """
+    batch = Batch(drive, truth)
+    poses, counted, x = first_poses(batch)
+    for i in range(len(batch.places)):
+        found = [_seen(batch, c, x, poses[c], i) for c in counted]
+        origin, ray = (np.concatenate(part) for part in zip(*found, strict=True))
+        if len(ray):
+            batch.places[i] = meeting_point(origin, ray)[0]
+    batch.base[batch.markers : batch.frame] = batch.places.ravel()
+    for c in range(len(batch.cars)):
+        if c not in counted:
+            poses[c] = batch.resected(c, np.arange(len(batch.places)))[0]
+    free = np.zeros(len(x), dtype=bool)
+    free[batch.markers : batch.frame] = batch.known[batch.markers : batch.frame]
+    batch.prior[batch.markers : batch.frame] = UNKNOWN_PLACE
+    for c in range(len(batch.cars)):
+        free[batch.own(c).start + np.array(NUISANCE)] = True
+        if batch.truth[c]:  # by which the camera and its clock show
+            free[batch.own(c)][[ROT.start, ROT.start + 1, ROT.start + 2, CAMERA_TIME]] = True
+    fit = batch.fit(Fit(x, tuple(poses), batch.scales(x, poses), free))
+    places = batch.places + fit.x[batch.markers : batch.frame].reshape(-1, 3)
+    starts = np.array([pose[0] for pose in fit.poses])
+    if not any(batch.truth):  # the first car's start becomes the origin
+        at, back = starts[0, 0] + 1j * starts[0, 1], np.exp(-1j * starts[0, 2])
+        for table in (places, starts):
+            flat = back * (table[:, 0] + 1j * table[:, 1] - at)
+            table[:, 0], table[:, 1] = flat.real, flat.imag
+        starts[:, 2] -= starts[0, 2]
+    return batch, fit, places, starts
+
+
+def _seen(batch: Batch, c: int, x: Array, pose: Array, target: int) -> tuple[Array, Array]:
+    """Return the lines of sight of a car to a target, by constants (G,) and its poses at keyframes."""
+    car, keys = batch.cars[c], batch.keys[c]
+    of = car.target == target
+    time = car.time[of] + x[batch.own(c).start + CAMERA_TIME]
+    place = np.interp(time, keys, pose[:, 0] + 1j * pose[:, 1])
+    cut = replace(car, ray=car.ray[of], time=time, target=car.target[of])
+    return lines_of_sight(cut, place, np.interp(time, keys, pose[:, 2]))
+
+
+@dataclass(frozen=True)
+class Room:
+    """An environment and a map of topics that are being written."""
+
+    raw: Mapping[str, Any]  # sections of the environment that it follows
+    title: str
+    cars: Mapping[str, Mapping[Role, str]]  # topics of every car
+    folder: Path
+
+    @property
+    def files(self) -> tuple[Path, Path]:
+        """The environment and the map."""
+        return self.folder / "environment.toml", self.folder / "topics.toml"
+
+    def write(
+        self, starts: Array, places: Mapping[str, Sequence[float]], markers: Mapping[str, int], own: Mapping[str, int]
+    ) -> None:
+        """Write starts (C, 3) of the cars, places of landmarks, their markers and those of cars."""
+        vehicles = dict(zip(self.cars, starts.tolist(), strict=True))
+        replace_text(self.files[0], environment_text(self.raw, self.title, vehicles, places))
+        replace_text(self.files[1], topics_text(self.title, self.cars, markers, own))
+
+
+def survey(bags: Sequence[Path], like: str, folder: Path, truth: bool = True) -> Survey:
+    """Solve the places of all markers of a drive, and write `environment.toml` and `topics.toml` into a folder.
+
+    Args:
+        bags: of one drive.
+        like: environment whose cameras, noise and observer count.
+        folder: where the files go.
+        truth: whether motion capture counts.
+
+    Raises:
+        CoopenvError: a bag cannot be read, or the drive does not determine the places.
+    """
+    template, title = load_scenario(like), listed([path.name for path in bags])
+    with ExitStack() as stack:
+        files = [stack.enter_context(BagFile(path)) for path in bags]
+        rows, _ = examined(files)
+        cars = cars_of(rows)
+        seen = markers_of(files, {name for topics in cars.values() for name in topics.values()})
+    numbers = sorted(number for number, frames in seen.items() if frames >= LEAST_FRAMES)
+    if not numbers:
+        raise DataError(f"{title}: no marker is in {LEAST_FRAMES} frames; frames with tags need a map")
+    raw = template.model_dump(mode="json", exclude_unset=True)
+    raw["horizon"] = float(np.ceil(max(row.messages / row.rate for row in rows if row.rate)))
+    room, apart = Room(raw, title, cars, folder), np.zeros((len(cars), 3))
+    apart[:, 0] = 10.0 * np.arange(len(cars))
+    unnamed = {f"M{number}": number for number in numbers}
+    room.write(apart, dict.fromkeys(unnamed, (0.0, 0.0, 0.0)), unnamed, {})
+    drive = drive_of_bag(open_bags(bags, {}, room.files[1]))
+    own, standing, notes = sorted_markers(drive, truth, numbers)
+    if not standing:
+        raise DataError(f"{title}: no marker stands still and is seen from several sides")
+    batch, fit, places, starts = solved(only(drive, [numbers.index(n) for n in standing]), truth)
+    names = {number: f"M{number}" for number in standing} | {number: car for car, number in own.items()}
+    error, has_truth = errors(batch, fit)[batch.markers : batch.frame].reshape(-1, 3), any(batch.truth)
+    if has_truth:
+        names |= same_names(template, standing, places)
+    for k, number in enumerate(standing):
+        if has_truth and (std := float(error[k].max())) > LARGEST_ERROR:
+            notes[number] = f"left out: known to {100.0 * std:.0f} cm; drive nearer, or past it"
+    solution = {number: (places[k].round(4), error[k]) for k, number in enumerate(standing) if number not in notes}
+    room.write(
+        starts,
+        {names[number]: place.tolist() for number, (place, _) in solution.items()},
+        {names[number]: number for number in solution},
+        own,
+    )
+    markers = []
+    for number in numbers:
+        place, std = solution.get(number, (np.zeros(0), np.zeros(0)))
+        known = tuple(place.tolist()), tuple(std.tolist()) if has_truth else ()
+        markers.append(SurveyedMarker(number, names.get(number, ""), seen[number], *known, notes.get(number, "")))
+    return Survey(tuple(markers), tuple(fit.sigma[:, 0].tolist()), has_truth, room.files)
+
+
+def only(drive: CalibrationDrive, kept: Sequence[int]) -> CalibrationDrive:
+    """Return a drive with some of its markers alone."""
+    number = np.full(len(drive.landmarks), -1)
+    number[list(kept)] = np.arange(len(kept))
+    cars = []
+    for car in drive.cars:
+        of = number[car.target] >= 0
+        columns = {key: getattr(car, key)[of] for key in ("time", "ray", "pixel")}
+        cars.append(replace(car, target=number[car.target[of]], **columns))
+    return replace(
+        drive,
+        cars=tuple(cars),
+        landmarks=tuple(drive.landmarks[i] for i in kept),
+        places=drive.places[list(kept)].copy(),
+    )
+
+
+def sorted_markers(
+    drive: CalibrationDrive, truth: bool, numbers: Sequence[int]
+) -> tuple[dict[str, int], list[int], dict[int, str]]:
+    """Return the markers that cars carry, by car, those that stand still, and why others are left out."""
+    batch = Batch(drive, truth)
+    poses, counted, x = first_poses(batch)
+    own: dict[str, int] = {}
+    standing, notes = [], {}
+    for i, number in enumerate(numbers):
+        found = [_seen(batch, c, x, poses[c], i) for c in counted]
+        origin, ray = (np.concatenate(part) for part in zip(*found, strict=True))
+        if len(ray) < LEAST_FRAMES // 2:
+            notes[number] = "too few sightings while the car moves"
+            continue
+        _, angle, deviation = meeting_point(origin, ray)
+        if carrier := _carrier(batch, x, poses, counted, i):
+            own[carrier] = number
+            notes[number] = f"carried by {carrier}"
+        elif angle > (MEETING if any(batch.truth) else 5.0 * MEETING):
+            notes[number] = f"lines of sight miss each other by {np.degrees(angle):.1f} deg: it moves, or two are alike"
+        elif deviation > VAGUE:
+            notes[number] = "seen from one side alone: its distance is not known"
+        else:
+            standing.append(number)
+    return own, standing, notes
+
+
+def _carrier(batch: Batch, x: Array, poses: Sequence[Array], counted: Sequence[int], target: int) -> str:
+    """Return the car that carries a marker: the one at which others look when they see it; empty without one."""
+    best, carrier = OWN, ""
+    for other in counted if any(batch.truth) else ():
+        off = []
+        for c in counted:
+            car = batch.cars[c]
+            if c == other or not (of := car.target == target).any():
+                continue
+            origin, ray = _seen(batch, c, x, poses[c], target)
+            there = np.interp(
+                car.time[of] + x[batch.own(c).start + CAMERA_TIME],
+                batch.keys[other],
+                poses[other][:, 0] + 1j * poses[other][:, 1],
+            )
+            line = np.stack([there.real, there.imag, origin[:, 2]], axis=-1) - origin
+            off.append(np.abs(np.angle((ray[:, 0] + 1j * ray[:, 1]) / (line[:, 0] + 1j * line[:, 1]))))
+        seen_by_itself = (batch.cars[other].target == target).any()
+        if off and not seen_by_itself and (angle := float(np.median(np.concatenate(off)))) < best:
+            best, carrier = angle, batch.cars[other].name
+    return carrier
+
+
+def same_names(template: Any, numbers: Sequence[int], places: Array) -> dict[int, str]:
+    """Return the names of landmarks of an environment by the numbers of markers that stand at their places."""
+    marks = [mark for mark in template.landmarks if mark.motion.kind == "static"]
+    if not marks:
+        return {}
+    apart = np.linalg.norm(places[:, None] - np.array([mark.position for mark in marks]), axis=-1)
+    pairs = zip(*linear_sum_assignment(apart), strict=True)
+    return {numbers[k]: marks[m].name for k, m in pairs if apart[k, m] < SAME}
+
+
+def environment_text(
+    raw: Mapping[str, Any], title: str, cars: Mapping[str, Sequence[float]], places: Mapping[str, Sequence[float]]
+) -> str:
+    """Return an environment with the sections of another, cars as vehicles at x, y, yaw, and landmarks at places."""
+    lines = [f"title = {json.dumps(f'Drive of {title}')}", f"horizon = {raw['horizon']}"]
+    for name in KEPT:
+        if section := raw.get(name):
+            lines += ["", f"[{name}]", *(f"{key} = {toml_value(value)}" for key, value in section.items())]
+    for name, place in places.items():
+        lines += ["", "[[landmarks]]", f"name = {json.dumps(name)}", f"position = {toml_value(list(place))}"]
+    shared = {
+        key: value
+        for key, value in raw["vehicles"][0].items()
+        if key in ("body", "marker", "initial_estimate") and value
+    }
+    for name, (x, y, yaw) in cars.items():
+        start = f"{{ position = [{x:.4f}, {y:.4f}, 0.0], yaw = {yaw:.4f} }}"
+        lines += ["", f"[[vehicles]] # {name}", f"initial_pose = {start}"]
+        lines += [f"{key} = {toml_value(value)}" for key, value in shared.items()]
+    return "\n".join(lines) + "\n"
+
+
+def topics_text(
+    title: str, cars: Mapping[str, Mapping[Role, str]], markers: Mapping[str, int], own: Mapping[str, int]
+) -> str:
+    """Return a map of topics whose environment stands beside it."""
+    lines = [f"# Proposed from {title}.", 'environment = "environment.toml"', 'names = "none"']
+    lines += [f"markers = {toml_value(markers)}"]
+    for car, topics in cars.items():
+        lines += ["", "[[cars]]", f'name = "{car}"', *([f"marker = {own[car]}"] if car in own else []), "[cars.topics]"]
+        lines += [f'{role.value} = "{topic}"' for role, topic in topics.items()]
+    return "\n".join(lines) + "\n"
+
+
+def toml_value(value: Any) -> str:
+    """Return a value of JSON as TOML, tables in a line; entries without a value are left out."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{json.dumps(k)} = {toml_value(v)}" for k, v in value.items() if v is not None) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(toml_value(entry) for entry in value) + "]"
+    return json.dumps(value)
