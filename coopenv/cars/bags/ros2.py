@@ -6,10 +6,9 @@ rate), `truth`, `estimate`, `camera_info`. Moving landmarks have `pose`, `/landm
 the truth or the estimate.
 """
 
-import json
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +20,7 @@ from coopenv.cars.backend.binding import marker_places
 from coopenv.cars.bags.files import METADATA, check_extra
 from coopenv.cars.messages.codec import encode, header, make, pose, ros2
 from coopenv.cars.settings.profile import TRANSFORMS
+from coopenv.cars.settings.toml import toml_text
 from coopenv.estimation.poses import Array, covariance_in_map, exp_so3, exp_translation, log_so3
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import named
@@ -296,25 +296,3 @@ def map_of(recording: Recording, scenario: Scenario) -> dict[str, Any]:
         "clocks": {"mode": "stamps"},
         "cars": cars,
     }
-
-
-def toml_text(table: Mapping[str, Any], path: str = "") -> str:
-    """Return plain data as TOML; values that are None are left out."""
-    lines, tables = list[str](), list[str]()
-    for key, value in table.items():
-        name = key if re.fullmatch(r"[\w-]+", key, re.ASCII) else json.dumps(key, ensure_ascii=False)
-        rows = [value] if isinstance(value, Mapping) else value if isinstance(value, list) else []
-        if rows and all(isinstance(row, Mapping) for row in rows):
-            head = f"[{path}{name}]" if isinstance(value, Mapping) else f"[[{path}{name}]]"
-            tables += [f"\n{head}\n{toml_text(row, f'{path}{name}.')}" for row in rows]
-        elif value is not None:
-            lines.append(f"{name} = {_value(value)}\n")
-    return "".join(lines + tables)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return f"{{ {', '.join(f'{json.dumps(key)} = {_value(part)}' for key, part in value.items())} }}"
-    if isinstance(value, list):
-        return f"[{', '.join(map(_value, value))}]"
-    return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 import warnings
 from collections import Counter
 from functools import cache
@@ -13,15 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from coopenv import CoopenvError
 from coopenv.base.errors import DataWarning
 from coopenv.cars.bags.bag import Bag
-from coopenv.cars.bags.ros2 import START, export_bag, toml_text, write_bag
+from coopenv.cars.bags.ros2 import START, export_bag, write_bag
 from coopenv.cli.app import main
 from coopenv.measurements.sensor import Sensor
 from coopenv.observers import Recording, run
@@ -223,23 +220,3 @@ def test_an_observer_that_fails_writes_nothing(tmp_path: Path) -> None:
     with pytest.raises(CoopenvError, match="no_such_observer"):
         export_bag(recorded("crossing_path"), tmp_path / "bag", "no_such_observer")
     assert not (tmp_path / "bag").exists()
-
-
-SCALARS = st.one_of(
-    st.booleans(), st.integers(-(2**60), 2**60), st.floats(allow_nan=False), st.text("aé\"\\\n\t ='#[]{}")
-)
-VALUES = st.recursive(SCALARS, lambda inner: st.lists(inner, max_size=3), max_leaves=6)
-TABLES = st.recursive(
-    st.dictionaries(st.text('abc.- é"', min_size=1, max_size=5), VALUES, max_size=4),
-    lambda inner: st.dictionaries(
-        st.text("xyz", min_size=1, max_size=3),
-        st.one_of(VALUES, inner, st.lists(inner, min_size=1, max_size=3)),
-        max_size=4,
-    ),
-    max_leaves=8,
-)
-
-
-@given(TABLES)
-def test_toml_reads_back_as_it_was(table: dict[str, Any]) -> None:
-    assert tomllib.loads(toml_text(table)) == table
