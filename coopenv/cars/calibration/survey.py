@@ -6,10 +6,11 @@ of the first car at the begin is the origin. A marker whose lines of sight do no
 Source: Hartley and Sturm, Triangulation, Computer Vision and Image Understanding 68(2), 1997 (iterated linear method).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -31,12 +32,13 @@ from coopenv.scenario import load_scenario
 LEAST_FRAMES = 50  # in which a marker must be seen
 FITTING, MEETING = 0.8, 0.03  # share of the lines of sight that pass a marker that stands within an angle, rad
 TRIPLES = 20  # of lines of sight that meet somewhere, of which the best is the start
+MUCH_BETTER = 0.5  # share of the angles at 0, above which first constants are 0
 ENOUGH = 100  # lines of sight to a marker, for first constants
 VAGUE = 0.1  # m, standard deviation of a place by its lines of sight, from which it is not known
 BIASES = np.linspace(-0.1, 0.1, 21)  # rad/s, gyro biases that are tried without motion capture
 OWN = 0.3  # rad, median angle between lines of sight to a marker on a car and to the car's origin
 UNKNOWN_PLACE = 10.0  # m, prior of a place
-LARGEST_ERROR = 0.02  # m, standard, of a place that is of use
+LARGEST_ERROR = (0.1, 0.02)  # m, standard, of a place that is of use, without motion capture and with it
 SAME = 0.3  # m, to a landmark of the environment that gives the name
 KEPT = ("rates", "camera", "noise", "map", "topology", "v2x", "observer", "dynamics")
 """Sections of an environment that the new one takes over."""
@@ -50,7 +52,7 @@ class SurveyedMarker:
     name: str  # of a landmark, or of the car that carries it; empty: neither
     frames: int
     position: tuple[float, ...] = ()  # m, map; empty: not solved
-    error: tuple[float, ...] = ()  # m, standard; empty: without motion capture
+    error: tuple[float, ...] = ()  # m, standard; without motion capture about the markers' middle and mean direction
     finding: str = ""
 
 
@@ -124,6 +126,7 @@ def first_poses(batch: Batch) -> tuple[list[Array], list[int], Array]:
             return float(np.median([meeting_point(origin, ray)[1] for origin, ray in some]))
 
         best, step = min(tried.tolist(), key=missed), float(tried[1] - tried[0])
+        best = best if missed(best) < MUCH_BETTER * missed(0.0) else 0.0
         bounds = best - step, best + step
         x[constant] = minimize_scalar(missed, bounds=bounds, method="bounded", options={"xatol": 0.02 * step}).x
     return [keyframe_poses(batch, c, x) for c in range(len(batch.cars))], known or [0], x
@@ -235,32 +238,34 @@ def survey(bags: Sequence[Path], like: str, folder: Path, truth: bool = True) ->
     room, apart = Room(raw, title, cars, folder), np.zeros((len(cars), 3))
     apart[:, 0] = 10.0 * np.arange(len(cars))
     unnamed = {f"M{number}": number for number in numbers}
-    room.write(apart, dict.fromkeys(unnamed, (0.0, 0.0, 0.0)), unnamed, {})
-    drive = drive_of_bag(open_bags(bags, {}, room.files[1]))
+    with TemporaryDirectory() as scratch:  # an environment in which every marker has some place, to read the bags
+        begun = replace(room, folder=Path(scratch))
+        begun.write(apart, dict.fromkeys(unnamed, (0.0, 0.0, 0.0)), unnamed, {})
+        drive = drive_of_bag(open_bags(bags, {}, begun.files[1]))
     own, standing, notes = sorted_markers(drive, truth, numbers)
-    if not standing:
-        raise DataError(f"{title}: no marker stands still and is seen from several sides")
+    _check_some(title, standing, notes)
     batch, fit, places, starts = solved(only(drive, [numbers.index(n) for n in standing]), truth)
+    error, has_truth = place_errors(batch, fit), any(batch.truth)
     names = {number: f"M{number}" for number in standing} | {number: car for car, number in own.items()}
-    error, has_truth = errors(batch, fit)[batch.markers : batch.frame].reshape(-1, 3), any(batch.truth)
-    if has_truth:
-        names |= same_names(template, standing, places)
-    for k, number in enumerate(standing):
-        if has_truth and (std := float(error[k].max())) > LARGEST_ERROR:
+    names |= same_names(template, standing, places) if has_truth else {}
+    for number, std in zip(standing, error.max(axis=1).tolist(), strict=True):
+        if std > LARGEST_ERROR[has_truth]:
             notes[number] = f"left out: known to {100.0 * std:.0f} cm; drive nearer, or past it"
-    solution = {number: (places[k].round(4), error[k]) for k, number in enumerate(standing) if number not in notes}
-    room.write(
-        starts,
-        {names[number]: place.tolist() for number, (place, _) in solution.items()},
-        {names[number]: number for number in solution},
-        own,
+    known = {n: (tuple(places[k].round(4).tolist()), tuple(error[k].tolist())) for k, n in enumerate(standing)}
+    solution = {number: entry for number, entry in known.items() if number not in notes}
+    _check_some(title, solution, notes)
+    marks = {names[number]: number for number in solution}
+    room.write(starts, {name: solution[number][0] for name, number in marks.items()}, marks, own)
+    markers = (
+        SurveyedMarker(n, names.get(n, ""), seen[n], *solution.get(n, ((), ())), notes.get(n, "")) for n in numbers
     )
-    markers = []
-    for number in numbers:
-        place, std = solution.get(number, (np.zeros(0), np.zeros(0)))
-        known = tuple(place.tolist()), tuple(std.tolist()) if has_truth else ()
-        markers.append(SurveyedMarker(number, names.get(number, ""), seen[number], *known, notes.get(number, "")))
     return Survey(tuple(markers), tuple(fit.sigma[:, 0].tolist()), has_truth, room.files)
+
+
+def _check_some(title: str, found: Collection[int], notes: Mapping[int, str]) -> None:
+    """Raise DataError, which says why, if there is no marker."""
+    if not found:
+        raise DataError(f"{title}: {'; '.join(f'marker {number}: {why}' for number, why in notes.items())}")
 
 
 def only(drive: CalibrationDrive, kept: Sequence[int]) -> CalibrationDrive:
@@ -328,6 +333,29 @@ def _carrier(batch: Batch, x: Array, poses: Sequence[Array], counted: Sequence[i
         if off and not seen_by_itself and (angle := float(np.median(np.concatenate(off)))) < best:
             best, carrier = angle, batch.cars[other].name
     return carrier
+
+
+def place_errors(batch: Batch, fit: Fit) -> Array:
+    """Return the standard errors (L, 3) of places, m.
+
+    Without motion capture nothing shows where the frame lies: its place and direction are projected out. Source: the
+    S-transformation of Baarda, Publications on Geodesy 5(1), 1973.
+    """
+    found = errors(batch, fit)[batch.markers : batch.frame].reshape(-1, 3)
+    if any(batch.truth):
+        return found
+    columns = np.flatnonzero(fit.free)
+    of = (columns >= batch.markers) & (columns < batch.frame)
+    places = (batch.places.ravel() + fit.x[batch.markers : batch.frame]).reshape(-1, 3)
+    moved = np.zeros((len(places), 3, 3))
+    moved[:, 0, 0] = moved[:, 1, 1] = 1.0
+    moved[:, 0, 2], moved[:, 1, 2] = -places[:, 1], places[:, 0]
+    T = moved.reshape(-1, 3)[columns[of] - batch.markers]
+    rest = np.eye(len(T)) - T @ np.linalg.pinv(T)
+    C = rest @ np.linalg.inv(batch.solved(fit, columns).S)[np.ix_(of, of)] @ rest.T
+    found[:] = 0.0
+    found.ravel()[columns[of] - batch.markers] = np.sqrt(np.maximum(C.diagonal(), 0.0))
+    return found
 
 
 def same_names(template: Any, numbers: Sequence[int], places: Array) -> dict[int, str]:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from coopenv.cars.calibration.drives import CalibrationDrive
-from coopenv.cars.calibration.survey import meeting_point, only, solved, sorted_markers
+from coopenv.cars.calibration.survey import meeting_point, only, place_errors, solved, sorted_markers
 from coopenv.cli.app import main
 from coopenv.scenario import load_scenario
 from tests.cars.calibration.test_calibrate import MARKERS, drive
@@ -53,6 +53,18 @@ def test_markers_are_solved_without_motion_capture_in_the_frame_of_the_start() -
     assert abs(fit) == pytest.approx(1.0, abs=0.005)
     assert np.abs(fit * found - true).max() < 0.02
     assert_allclose(places[:, 2], MARKERS[:, 2], atol=0.01)
+
+
+def test_errors_without_motion_capture_are_about_the_markers_themselves() -> None:
+    batch, fit, places, _ = solved(unknown(drive()), False)
+    error = place_errors(batch, fit)
+    assert error.shape == places.shape and error.min() > 0.0 and error.max() < 0.05
+    given = unknown(drive())
+    (car,) = given.cars
+    first = car.time < car.time[0] + 3.0
+    short = replace(car, **{key: getattr(car, key)[first] for key in ("time", "target", "ray", "pixel")})
+    batch, fit, _, _ = solved(replace(given, cars=(short,)), False)
+    assert place_errors(batch, fit).max() > 3.0 * error.max()
 
 
 def test_a_marker_that_moves_is_left_out_and_said_so() -> None:
