@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.messages import codec
+from coopenv.cars.messages.readings import OTHER_FIELDS
 from coopenv.cars.messages.vision import frame_of
 from coopenv.cars.settings.profile import IMAGE
 
@@ -78,7 +79,7 @@ def with_raw_frame(channel: BagChannel, received: int, data: bytes, colours: boo
         message = decode(channel, data)
         frame = frame_of(message, "BGR" if colours else "GRAY")
         about = codec.header(codec.stamp_of(message), str(message.header.frame_id))
-    except CoopenvError as error:
+    except (CoopenvError, *OTHER_FIELDS) as error:
         return channel._replace(encoding=REFUSED), received, str(error).encode()
     height, width = frame.shape[:2]
     layout = {"height": height, "width": width, "encoding": "bgr8" if colours else "mono8", "step": frame.strides[0]}

@@ -162,7 +162,7 @@ class BagFile:
                     text = f"topic {channel.topic}: messages are left out that were received after 2096"
                     warnings.warn(f"{self.path}: {text}", DataWarning, stacklevel=3)
         except (ReaderError, TooLargeError) as error:
-            raise DataError(f"{self.path}: {error}") from None
+            raise DataError(f"{self.path}: {str(error) or type(error).__name__}") from None
 
     def _merged(self, wanted: Collection[BagChannel], frames: bool) -> Iterator[tuple[BagChannel, int, bytes]]:
         """Yield the messages of all parts, in the reader process."""

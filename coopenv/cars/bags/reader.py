@@ -37,7 +37,7 @@ CHANNEL, BYTES, NOTHING, ERROR, END = b"C", b"B", b"N", b"E", b"."
 
 
 class ReaderError(ValueError):
-    """The reader process has ended before the file."""
+    """The reader process has ended before the file, or has raised an error of the subclass's name."""
 
 
 def in_reader(make: Callable[[], Iterator[Record]], size: int) -> Iterator[Record]:
@@ -49,7 +49,7 @@ def in_reader(make: Callable[[], Iterator[Record]], size: int) -> Iterator[Recor
 
     Raises:
         ReaderError: the child has crashed, or exceeded its limits.
-        TooLargeError: the generator raised it; other errors of it are raised as a subclass of Exception of that name.
+        TooLargeError: the generator raised it; other errors of it are raised as a ReaderError of that name.
     """
     if not APART:
         yield from make()
@@ -87,7 +87,7 @@ def _received(stream: BinaryIO) -> Generator[Record, None, bool]:
             channels.append(BagChannel(*map(str, json.loads(data))))
         elif kind == ERROR:
             name, text = json.loads(data)
-            raise (TooLargeError if name == TooLargeError.__name__ else type(name, (Exception,), {}))(text)
+            raise (TooLargeError if name == TooLargeError.__name__ else type(name, (ReaderError,), {}))(text)
         else:
             yield channels[number], time, data if kind == BYTES else None
     return False

@@ -71,7 +71,7 @@ class Part:
                 if data is not None and channel in wanted:
                     allowance.take(round(IN_MEMORY * growth))
                     yield channel, received, _unpacked(data, allowance) if data[:4] == ZSTD else data
-        except TooLargeError:
+        except (MemoryError, TooLargeError):
             raise
         except Exception:  # as it was noted when the file was opened
             return

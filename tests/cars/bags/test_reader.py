@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coopenv import DataError
+from coopenv import CoopenvError, DataError
 from coopenv.cars.bags import reader, streams
 from coopenv.cars.bags.definitions import BagChannel
 from coopenv.cars.bags.files import BagFile
@@ -143,6 +143,34 @@ def test_a_hole_of_a_library_is_one_line(
         monkeypatch.setitem(streams.FORMS, ".mcap", hole(100))
         with pytest.raises(DataError, match=r"bag\.mcap: the process that reads the file ended by SIGABRT"):
             [*bag.messages(bag.topics)]
+
+
+def test_a_want_of_memory_at_the_second_look_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    path = next(bags.write(tmp_path / "bag", bags.sent()[:200], "mcap").glob("*.mcap"))
+    with BagFile(path) as bag:
+        read = streams.FORMS[".mcap"]
+
+        def hungry(*given: Any) -> Iterator[Any]:
+            for n, entry in enumerate(read(*given)):
+                if n == 100:
+                    raise MemoryError
+                yield entry
+
+        monkeypatch.setitem(streams.FORMS, ".mcap", hungry)
+        with pytest.raises(DataError, match=r"bag\.mcap: MemoryError$"):
+            [*bag.messages(bag.topics)]
+
+
+def test_a_frame_with_other_fields_is_refused_alone(tmp_path: Path) -> None:
+    kind, text = "sensor_msgs/msg/CompressedImage", "std_msgs/Header header\nuint8 data\n"
+    _, opened, _ = bags.writer(tmp_path / "bag", "mcap")
+    with opened as bag:
+        connection = bag.add_connection("/frames", kind, msgdef=text, rihs01="RIHS01_0")
+        bag.write(connection, 1, b"\0\1\0\0" + bytes(13))
+    with BagFile(tmp_path / "bag") as found:
+        [(_, _, decoded)] = found.messages(["/frames"])
+        with pytest.raises(CoopenvError):
+            decoded()
 
 
 def test_compressed_frames_come_as_raw_ones(tmp_path: Path) -> None:
