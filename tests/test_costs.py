@@ -12,6 +12,7 @@ import tracemalloc
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,6 +34,14 @@ from coopenv.sources.mcap import read_recording, write_recording
 from coopenv.sumo import files as sumo_files
 from coopenv.training.settings import read_settings
 from tests.helpers import bags, builders, mrclam_files
+
+
+@pytest.fixture(autouse=True)
+def bags_are_read_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Calls of another process are not counted."""
+    if find_spec("rosbags") is not None:
+        monkeypatch.setattr("coopenv.cars.bags.reader.APART", False)
+
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "SECURITY.md"

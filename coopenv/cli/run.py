@@ -100,11 +100,12 @@ def refuse_for_recordings(environment: str, seed: int, policy: str) -> None:
 class RecordOptions(options.SourceOptions):
     """Options of `coopenv record`."""
 
-    out: Annotated[Path, typer.Option(help="MCAP file to write.")]
+    out: Annotated[Path, typer.Option(help="MCAP file to write; with --ros a folder.")]
     seed: options.Seed = 0
     policy: options.PolicyName = "zero"
     observer: options.LogObserver = None
     scene: options.LogScene = True
+    ros: Annotated[bool, typer.Option("--ros", help="Write a plain ROS 2 bag, with the map to read it back.")] = False
     no_replay: Annotated[bool, typer.Option("--no-replay", help="Write no page that plays the episode.")] = False
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False
 
@@ -129,11 +130,11 @@ def record(given: RecordOptions) -> None:
         write_log,
         write_page,
     )
-    from coopenv.sources.registry import kind_of
+    from coopenv.sources.registry import kind_of, write_as
     from coopenv.sources.sources import allow_kinds, open_backend, open_recording
 
     out, page, observer, environment = given.out, given.out.with_suffix(".html"), given.observer, given.environment
-    check_log(out, observer, given.scene)
+    check_log(out.with_suffix(".mcap") if given.ros else out, observer, given.scene)
     for path in (out, *([] if given.no_replay else [page])):
         check_new(path, given.force)
     kind = kind_of(environment, given.topics)
@@ -152,7 +153,10 @@ def record(given: RecordOptions) -> None:
                 backend, given.seed, given.policy, progress.update, name=out.name, on_failure=failures.append
             )
         recording, played = episode.measured, episode.drawn(frame_stride(episode.scenario))
-    write_log(recording, out, log, observer, given.scene)
+    if given.ros:
+        write_as("ros2", recording, out, (observer or observer_of(recording)) if given.scene else None)
+    else:
+        write_log(recording, out, log, observer, given.scene)
     count = len(recording.setups)
     facts = f"{count} vehicle{'' if count == 1 else 's'}, {recording.ticks} ticks, {recording.t[-1]:g} s"
     options.console().print(f"{out}: {facts}", soft_wrap=True)
@@ -186,7 +190,10 @@ def check_log(out: Path, observer: str | None, scene: bool) -> None:
         find(named(observer))
 
 
-ExportFormat = StrEnum("ExportFormat", {"tum": "tum", "csv": "csv", "parquet": "parquet", "layout": "foxglove-layout"})
+ExportFormat = StrEnum(
+    "ExportFormat",
+    {"tum": "tum", "csv": "csv", "parquet": "parquet", "layout": "foxglove-layout", "ros2": "ros2"},
+)
 Exported = Annotated[
     Path,
     typer.Argument(
@@ -223,20 +230,24 @@ def export(
         typer.Option(
             "--format",
             help="tum: true and estimated trajectories of a run, which evo reads. csv, parquet: its table, a row per "
-            "tick and vehicle. foxglove-layout: how Foxglove and Lichtblick arrange a log.",
+            "tick and vehicle. foxglove-layout: how Foxglove and Lichtblick arrange a log. ros2: a log as a plain "
+            "ROS 2 bag.",
         ),
     ] = ExportFormat.tum,
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of the trajectories (default: RUN/tum), or file (default: RUN/trajectory.csv or .parquet; "
-            f"{LAYOUT_FILE})."
+            help="Folder of the trajectories (default: RUN/tum) or of the bag (default: FILE), or file (default: "
+            f"RUN/trajectory.csv or .parquet; {LAYOUT_FILE})."
         ),
     ] = None,
 ) -> None:
     """Write a run or a log in the formats of other programs."""
     if file_format is ExportFormat.layout:
         _export_layout(source, out or Path(LAYOUT_FILE))
+        return
+    if file_format is ExportFormat.ros2:
+        _export_log(source, out or source.with_suffix(""), file_format.value)
         return
     from coopenv.runs.command import Results
     from coopenv.runs.exports import write_tum
@@ -250,6 +261,18 @@ def export(
     folder = out or source / file_format.value
     paths = write_tum(results.trajectory, folder)
     options.console().print(f"Files in {folder}: {', '.join(path.name for path in paths)}", soft_wrap=True)
+
+
+def _export_log(log: Path, out: Path, form: str) -> None:
+    from coopenv.base.files import check_new
+    from coopenv.runs.scenes import observer_of
+    from coopenv.sources.registry import write_as
+    from coopenv.sources.sources import open_recording
+
+    check_new(out, force=False)
+    recording = open_recording(log)
+    write_as(form, recording, out, observer_of(recording))
+    options.console().print(f"{out}: {len(recording.setups)} vehicles, {recording.ticks} ticks", soft_wrap=True)
 
 
 def _export_layout(log: Path, out: Path) -> None:

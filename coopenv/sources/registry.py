@@ -53,6 +53,8 @@ class SourceKind:
     """Variants of its records by name, each with its meaning; empty: those with faults."""
     caveat: str = ""
     """Note below tables of its records."""
+    writers: Mapping[str, str] = field(default_factory=dict)
+    """Functions of a `Recording`, a path and an observer's name (None: no estimates) that write it, by format."""
     simulation: str = ""
     """Backend, made of the scenario, of environments whose key `sensing` is the name of the entry point."""
 
@@ -115,6 +117,11 @@ def kinds(asked: str = "") -> dict[str, SourceKind]:
             if name == asked:
                 raise
     return found
+
+
+def write_as(form: str, recording: Recording, path: Path, observer: str | None) -> None:
+    """Write a recording in a format of `SourceKind.writers`. Raises CoopenvError: it cannot be written."""
+    call(next(kind.writers[form] for kind in kinds().values() if form in kind.writers), recording, path, observer)
 
 
 def watched() -> list[str]:

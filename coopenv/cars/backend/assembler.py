@@ -25,6 +25,7 @@ from coopenv.cars.gate.gate import MOST_AHEAD
 from coopenv.cars.link.transport import Arrival, Transport
 from coopenv.cars.messages.codec import decode, stamp_of
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.messages.stated import stated
 from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.deployment import Deployment
 from coopenv.cars.settings.profile import Role
@@ -323,7 +324,7 @@ class Intake:
         if arrival.topic in self.clocks and not self.clocks[arrival.topic].put(stamp, arrival.received):
             self.rejected[car]["outlying stamp"] += 1
             return
-        yield Sample(car, role, stamp, arrival.received, value)
+        yield Sample(car, role, stamp, arrival.received, value, stated(message))
 
     def offset_of(self, car: str) -> float:
         """Return the least offset of the topics of a car, without motion capture, s; NaN: no message yet."""

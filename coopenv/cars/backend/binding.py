@@ -57,6 +57,7 @@ def bind(
     where: str,
     only: str | None,
     profile: CarProfile = SVEA,
+    calibrated: bool = True,
 ) -> Binding:
     """Return the binding.
 
@@ -67,6 +68,7 @@ def bind(
         where: name of the file, for errors.
         only: the car whose vehicle alone is estimated here; None: all are.
         profile: make of the cars.
+        calibrated: the environment needs the calibration of every camera, see `check_calibrated`.
 
     Raises:
         CoopenvError: a name is not of the scenario, a vehicle has no car, or the camera has no calibration; the
@@ -96,16 +98,21 @@ def bind(
             target = len(landmarks) + chosen[car.name]
         if car.marker is not None:
             targets[car.marker] = target
-    for i, camera in enumerate(scenario.cameras):
-        if camera.model != "pinhole":
-            raise CoopenvError(
-                f"{where}: the camera of {vehicles[i]} has no calibration: [camera] of the environment needs "
-                'model = "pinhole", image_size, focal_length, principal_point and distortion'
-            )
+    for i in range(len(vehicles)) if calibrated else ():
+        check_calibrated(scenario, i, where)
     if only is not None:
         check_one_of(f"{where}: unknown car", only, chosen)
     local = tuple(range(len(vehicles))) if only is None else (chosen[only],)
     return Binding(scenario, chosen, led, targets, local, profile)
+
+
+def check_calibrated(scenario: Scenario, vehicle: int, where: str) -> None:
+    """Refuse a vehicle's camera without a calibration, which turns pixels into bearings, with a CoopenvError."""
+    if scenario.cameras[vehicle].model != "pinhole":
+        raise CoopenvError(
+            f"{where}: the camera of {scenario.vehicle_names[vehicle]} has no calibration: [camera] of the environment "
+            'needs model = "pinhole", image_size, focal_length, principal_point and distortion'
+        )
 
 
 def _index(known: Sequence[str], name: str, where: str) -> int:

@@ -82,6 +82,7 @@ BAG = SourceKind(
     options=("topics", "selection"),
     recorded=True,
     conversion="coopenv import",
+    writers={"ros2": "coopenv.cars.bags.ros2:export_bag"},
 )
 DRIVE = SourceKind(
     title="a drive of cars, which --map opens as a bag",

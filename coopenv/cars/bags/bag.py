@@ -95,7 +95,8 @@ class Bag(TickGenerator):
             warnings.simplefilter("ignore", ScenarioWarning)  # repeated below
             scenario = load_scenario(self.map.environment_path, changes)
         self._rate = float(scenario.rates.camera)
-        self.binding = bind(scenario, self.map.cars, self.map.markers, self.map.path.name, None, self.map.make)
+        where = self.map.path.name
+        self.binding = bind(scenario, self.map.cars, self.map.markers, where, None, self.map.make, calibrated=False)
         self.kept = self._kept(robots)
         read = [car for car in self.map.cars if self.binding.cars.get(car.name, self.kept[0]) in self.kept]
         self.log = read_log([Path(path) for path in paths], self.map.model_copy(update={"cars": read}), self.binding)

@@ -17,9 +17,14 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.messages import codec
+from coopenv.cars.messages.readings import OTHER_FIELDS
+from coopenv.cars.messages.vision import frame_of
+from coopenv.cars.settings.profile import IMAGE
 
 CDR, ROS1 = "cdr", "ros1"
 """Encodings of messages that are read."""
+REFUSED = "refused"
+"""In place of the encoding of a message that the reader process has refused; its bytes are the reason."""
 MOST_TEXT = 2**17  # characters; the largest definitions of ROS, nested ones included, have some 60,000
 MOST_OBJECTS, MOST_FIXED = 300_000, 1_000
 """Python objects that a message may become, some 100 MB, and those of a type without its sequences."""
@@ -57,6 +62,8 @@ def decode(channel: BagChannel, data: bytes) -> Any:
         CoopenvError: the bytes are no message, or may be one of more objects than `MOST_OBJECTS`, or the type has no
             usable definition.
     """
+    if channel.encoding == REFUSED:
+        raise CoopenvError(data.decode())
     store, cost, why = _store(channel)
     if cost.objects + cost.per_byte * len(data) > MOST_OBJECTS:
         raise CoopenvError(f"{channel.kind}: {len(data)} bytes may hold over {MOST_OBJECTS} values")
@@ -64,6 +71,20 @@ def decode(channel: BagChannel, data: bytes) -> Any:
         return (store.deserialize_ros1 if channel.encoding == ROS1 else store.deserialize_cdr)(data, channel.kind)
     except Exception as error:  # any error of the library at malformed bytes
         raise CoopenvError(f"{channel.kind}: cannot be read ({type(error).__name__}){why}") from None
+
+
+def with_raw_frame(channel: BagChannel, received: int, data: bytes, colours: bool) -> tuple[BagChannel, int, bytes]:
+    """Return a CompressedImage of a channel as an Image in CDR, with colours or in shades of grey."""
+    try:
+        message = decode(channel, data)
+        frame = frame_of(message, "BGR" if colours else "GRAY")
+        about = codec.header(codec.stamp_of(message), str(message.header.frame_id))
+    except (CoopenvError, *OTHER_FIELDS) as error:
+        return channel._replace(encoding=REFUSED), received, str(error).encode()
+    height, width = frame.shape[:2]
+    layout = {"height": height, "width": width, "encoding": "bgr8" if colours else "mono8", "step": frame.strides[0]}
+    raw = codec.encode(codec.make(IMAGE, header=about, data=frame, **layout))
+    return BagChannel(channel.topic, IMAGE, CDR), received, raw
 
 
 def stamp(channel: BagChannel, data: bytes) -> int:

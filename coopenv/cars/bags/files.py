@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, error_text, listed, printable
 from coopenv.base.installation import install_command
 from coopenv.cars.backend.sources import metadata_names
+from coopenv.cars.settings.profile import COMPRESSED
 from coopenv.sources.mcap_format import MAGIC, REPAIR
 
 if TYPE_CHECKING:
@@ -45,14 +46,14 @@ YEAR = 10**9 * 86_400 * 365  # ns
 class BagFile:
     """An open bag; a context manager."""
 
-    def __init__(self, path: Path) -> None:
-        """Open a bag.
+    def __init__(self, path: Path, colours: bool = False) -> None:
+        """Open a bag; compressed frames are decoded with colours or in shades of grey.
 
         Raises:
             CoopenvError: the extra is not installed.
             DataError: no such bag, none at all, or damaged beyond reading.
         """
-        self.path = path
+        self.path, self._colours = path, colours
         check_extra()
         if not path.exists():
             raise DataError(f"no such bag: {path}")
@@ -110,16 +111,13 @@ class BagFile:
 
     def _unpacked(self, file: Path) -> Path:
         """Return a copy of a packed file that is unpacked, until the bag is closed. Raises TooLargeError."""
-        import zstandard
-
-        from coopenv.sources.mcap_container import Allowance
+        from coopenv.cars.bags.reader import in_reader
+        from coopenv.cars.bags.streams import blocks_of
 
         place = Path(self._stack.enter_context(tempfile.TemporaryDirectory()), file.name.removesuffix(PACKED))
-        allowance = Allowance(file.stat().st_size)
-        with file.open("rb") as packed, place.open("wb") as out:
-            for data in zstandard.ZstdDecompressor().read_to_iter(packed):
-                allowance.take(len(data))
-                out.write(data)
+        with place.open("wb") as out:
+            for _, _, block in in_reader(partial(blocks_of, file), file.stat().st_size):
+                out.write(block or b"")
         return place
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Callable[[], Any]]]:
@@ -133,7 +131,7 @@ class BagFile:
         for topic, count in Counter(c.topic for c in self.channels if c.topic in topics).items():
             if count > MOST_DEFINITIONS:
                 raise DataError(f"{self.path}: {printable(topic)} has over {MOST_DEFINITIONS} types and definitions")
-        for channel, received, data in self._raw(topics):
+        for channel, received, data in self._raw(topics, frames=True):
             yield channel.topic, received, partial(decode, channel, data)
 
     def times(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
@@ -147,20 +145,34 @@ class BagFile:
         tables = {name: np.array(rows, np.int64).reshape(-1, 2).T for name, rows in ordered.items()}
         return {name: (stamps, received) for name, (stamps, received) in tables.items()}
 
-    def _raw(self, topics: Collection[str]) -> Iterator[tuple[BagChannel, int, bytes]]:
+    def _raw(self, topics: Collection[str], frames: bool = False) -> Iterator[tuple[BagChannel, int, bytes]]:
+        """Yield channel, time of reception and bytes of messages; with `frames` compressed ones as raw ones."""
+        from coopenv.cars.bags.reader import ReaderError, in_reader
         from coopenv.sources.mcap_container import TooLargeError
 
         wanted = {channel for channel in self.channels if channel.topic in topics}
-        parts = [part.messages(wanted) for part in self._parts] if wanted else []
+        if not wanted:
+            return
+        size = sum(part.path.stat().st_size for part in self._parts)
         try:
-            for channel, received, data in merge(*parts, key=itemgetter(1)):
+            for channel, received, data in in_reader(lambda: self._merged(wanted, frames), size):
                 if 0 <= received < LATEST:
-                    yield channel, received, data
+                    yield channel, received, data or b""
                 else:
                     text = f"topic {channel.topic}: messages are left out that were received after 2096"
                     warnings.warn(f"{self.path}: {text}", DataWarning, stacklevel=3)
-        except TooLargeError as error:
-            raise DataError(f"{self.path}: {error}") from None
+        except (ReaderError, TooLargeError) as error:
+            raise DataError(f"{self.path}: {str(error) or type(error).__name__}") from None
+
+    def _merged(self, wanted: Collection[BagChannel], frames: bool) -> Iterator[tuple[BagChannel, int, bytes]]:
+        """Yield the messages of all parts, in the reader process."""
+        from coopenv.cars.bags.definitions import with_raw_frame
+
+        for channel, received, data in merge(*(part.messages(wanted) for part in self._parts), key=itemgetter(1)):
+            if frames and channel.kind == COMPRESSED:
+                yield with_raw_frame(channel, received, data, self._colours)
+            else:
+                yield channel, received, data
 
     def _warn(self, others: Sequence[str]) -> None:
         """Warn of parts that are damaged, and of channels that are left out because of their encoding.

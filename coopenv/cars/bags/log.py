@@ -17,21 +17,25 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from itertools import compress, groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, listed
-from coopenv.cars.backend.binding import Binding
+from coopenv.cars.backend.binding import Binding, check_calibrated
 from coopenv.cars.bags.clocks import Delay, Leads, checked, jumps, leads_of, moves_of
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TRUTH, Chosen, ClockSettings, MapFrame, TopicMap, select
-from coopenv.cars.bags.topics import NS, TopicRow, regularity, unread_truth
+from coopenv.cars.bags.topics import NS, TopicRow, regularity
+from coopenv.cars.bags.transforms import StaticTree, odd_mountings, unread_truth
 from coopenv.cars.bags.turning import turn_contradiction
 from coopenv.cars.gate.wheel_command import read_drive
 from coopenv.cars.messages.codec import encode, stamp_of
-from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.messages.detectors import PLACED
+from coopenv.cars.messages.readings import OTHER_FIELDS, CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.messages.stated import Stated, stated
 from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.profile import Role
 from coopenv.cars.settings.sensors import Correction
@@ -92,8 +96,8 @@ def recorders(files: Sequence[Delays]) -> list[int | None]:
     return behind
 
 
-ReadValue = Callable[[Chosen, Any], Value]
-"""Returns the value of a message of a topic. Raises CoopenvError: it is malformed."""
+ReadValue = Callable[[Chosen, Any, CarPose | None], Value]
+"""Returns the value of a message of a topic, which may be known already. Raises CoopenvError: it is malformed."""
 
 
 def value_reader(
@@ -116,16 +120,17 @@ def value_reader(
     right = Correction()
     frames = {Role.TRUTH: given.frames.truth or given.frames.map}
 
-    def read_value(entry: Chosen, message: Any) -> Value:
+    def read_value(entry: Chosen, message: Any, known_already: CarPose | None) -> Value:
         calibration = calibrations.get(entry.car)
         if entry.role is Role.MANUAL:
             return read_drive(encode(message), binding.profile.command)
-        value = read(entry.role, message, calibration, distorted=given.distorted, vision=given.vision)
+        value = known_already or read(entry.role, message, calibration, distorted=given.distorted, vision=given.vision)
         if isinstance(value, Detections) and (others := [m for m in value.markers if m not in known]):
             unknown.update(others)
             there = [m in known for m in value.markers]
-            markers = tuple(m for m in value.markers if m in known)
-            value = replace(value, markers=markers, bearings=value.bearings[there], dropped=value.dropped + len(others))
+            markers, qualities = (tuple(compress(some, there)) for some in (value.markers, value.qualities))
+            kept: dict[str, Any] = {"markers": markers, "bearings": value.bearings[there], "qualities": qualities}
+            value = replace(value, dropped=value.dropped + len(others), **kept)
         if isinstance(value, CarPose):
             return in_frame(value, frames.get(entry.role, given.frames.map))
         if isinstance(value, Twist):
@@ -135,9 +140,14 @@ def value_reader(
     return read_value
 
 
-def _published(files: Sequence[BagFile], chosen: Collection[Chosen], given: TopicMap) -> dict[str, Calibration]:
-    """Return the first usable calibration of each car that publishes one."""
-    cars, found = {e.topic: e.car for e in chosen if e.role is Role.CAMERA_INFO}, dict[str, Calibration]()
+def _published(
+    files: Sequence[BagFile], chosen: Collection[Chosen], given: TopicMap
+) -> dict[str, tuple[Calibration, Stated]]:
+    """Return the first usable calibration of each car that publishes one, and what its message states besides."""
+    cars, found = (
+        {e.topic: e.car for e in chosen if e.role is Role.CAMERA_INFO},
+        dict[str, tuple[Calibration, Stated]](),
+    )
     for file in files:
         left, why = cars.keys() & file.topics.keys(), dict[str, str]()
         for topic, _, decode in file.messages(frozenset(left)) if left else ():
@@ -147,11 +157,11 @@ def _published(files: Sequence[BagFile], chosen: Collection[Chosen], given: Topi
                     if np.any(getattr(message, "k", getattr(message, "K", 1.0))):
                         value = read(Role.CAMERA_INFO, message, vision=given.vision)
                         if isinstance(value, Calibration):
-                            found.setdefault(cars[topic], value)
+                            found.setdefault(cars[topic], (value, stated(message)))
                         left.remove(topic)
                     else:
                         why.setdefault(topic, "")
-                except CoopenvError as error:
+                except (CoopenvError, *OTHER_FIELDS) as error:
                     why[topic] = why.get(topic) or str(error)
             if not left:
                 break
@@ -233,30 +243,42 @@ APART = NS  # ns between the delays of two topics of a car beyond which they hav
 
 
 def tracks_of(
-    number: int, file: BagFile, chosen: Collection[Chosen], value: ReadValue, clocks: ClockSettings
+    number: int, file: BagFile, chosen: Collection[Chosen], value: ReadValue, clocks: ClockSettings, tree: StaticTree
 ) -> list[Track]:
-    """Return the messages of a file, by its number, on the chosen topics."""
+    """Return the messages of a file, by its number, on the chosen topics; `tree` has its static transforms."""
     wanted = [entry for entry in chosen if entry.role is not Role.CAMERA_INFO and entry.topic in file.topics]
-    tracks = {entry.topic: Track(number, entry) for entry in sorted(wanted, key=lambda entry: entry.topic)}
-    for topic, received, decode in file.messages(tracks):
-        track = tracks[topic]
-        entry = track.chosen
-        try:
-            message = decode()
-            stamp, found = 0 if clocks.mode == "received" else stamp_of(message), value(entry, message)
-            if stamp:
-                late = found.late if isinstance(found, Detections) else 0
-                stamp += late + round(clocks.leads.get(topic, 0.0) * NS)
-            track.entries.append(Sample(entry.car, entry.sample_role, stamp, received, found))
-        except CoopenvError as error:
-            track.refused[str(error)] += 1
-        except (AttributeError, TypeError, ValueError) as error:  # a definition with other fields than ours
-            track.refused[f"{file.topics[topic]} has other fields than expected ({error})"] += 1
-    for track in tracks.values():
+    tracks = [Track(number, entry) for entry in sorted(wanted, key=lambda entry: (entry.topic, entry.frame))]
+    by_topic = {topic: [*some] for topic, some in groupby(tracks, key=lambda track: track.chosen.topic)}
+    for topic, received, decode in file.messages(by_topic):
+        for track in by_topic[topic]:
+            try:
+                if (sample := _sample(track.chosen, decode(), received, value, clocks, tree)) is not None:
+                    track.entries.append(sample)
+            except CoopenvError as error:
+                track.refused[str(error)] += 1
+            except OTHER_FIELDS as error:  # of its stamp or its transforms
+                track.refused[f"{file.topics[topic]} has other fields than expected ({error})"] += 1
+    for track in tracks:
         if file.dated:
             track.date_undated()
         track.clean_stamps(clocks.mode)
-    return list(tracks.values())
+    return tracks
+
+
+def _sample(
+    entry: Chosen, message: Any, received: int, value: ReadValue, clocks: ClockSettings, tree: StaticTree
+) -> Sample | None:
+    """Return the sample of a message; None: transforms of other frames. Raises CoopenvError: it is malformed."""
+    place = None
+    if entry.frame:
+        if (moved := tree.body_at(message, entry.frame)) is None:
+            return None
+        message, place = moved
+    stamp, found = 0 if clocks.mode == "received" else stamp_of(message), value(entry, message, place)
+    if stamp:
+        late = found.late if isinstance(found, Detections) else 0
+        stamp += late + round(clocks.leads.get(entry.topic, 0.0) * NS)
+    return Sample(entry.car, entry.sample_role, stamp, received, found, stated(message))
 
 
 def delays_of(tracks: Sequence[Track], files: int, tolerance: float, stated: Collection[str] = ()) -> list[Delays]:
@@ -325,6 +347,8 @@ class BagLog:
     """Detections by the number of the marker, of markers that are not in the map."""
     sent: Mapping[tuple[str, Role], tuple[Sample, ...]] = field(default_factory=dict)
     """Samples with unchanged times, by car and role."""
+    cameras: Mapping[str, Stated] = field(default_factory=dict)
+    """Contents of the CameraInfo of each car that publishes one, beside the calibration in `lenses`."""
 
 
 def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog:
@@ -340,17 +364,25 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     """
     where = ", ".join(str(path) for path in paths)
     with ExitStack() as stack:
-        files = [stack.enter_context(BagFile(path)) for path in paths]
+        files = [stack.enter_context(BagFile(path, bool(given.vision.colours))) for path in paths]
         topics = {name: kind for file in files for name, kind in file.topics.items()}
         chosen = select(given, topics, where)
-        lenses = {name: Calibration.of(binding.scenario.cameras[vehicle]) for name, vehicle in binding.cars.items()}
+        cameras = {car: binding.scenario.cameras[vehicle] for car, vehicle in binding.cars.items()}
+        lenses = {car: Calibration.of(camera) for car, camera in cameras.items() if camera.model == "pinhole"}
         if given.vision.rectified:
             lenses = {name: replace(lens, distortion=(0.0,) * 5) for name, lens in lenses.items()}
-        lenses |= _published(files, chosen, given)  # a calibration that a car publishes replaces the environment's
+        published = _published(files, chosen, given)
+        lenses |= {car: lens for car, (lens, _) in published.items()}  # it replaces the environment's
         lenses |= {car: made.lens(lenses[car]) for car, made in given.corrections.items() if car in lenses}
+        placed = {e.car for e in chosen if e.role is Role.DETECTIONS and topics[e.topic] in PLACED}
+        for car in binding.cars.keys() - lenses.keys() - placed:
+            check_calibrated(binding.scenario, binding.cars[car], given.path.name)
         unknown = Counter[int]()
         value, mode = value_reader(given, binding, chosen, lenses, unknown), given.clocks.mode
-        tracks = [track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, given.clocks)]
+        tree = StaticTree.of(files)
+        tracks = [
+            track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, given.clocks, tree)
+        ]
         elsewhere = [*unread_truth(files, given, chosen)]
     known = sorted(entry.topic for entry in chosen)
     for key in ("offsets", "leads"):
@@ -378,8 +410,10 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         and (unread := [name for name, kind in topics.items() if kind == IMU and name not in used])
     ):
         notes.append(f"turn rates of {listed(cars)} are the wheels'; unread: {listed(unread)}, of type {IMU}")
-    notes += [*_turn_notes(samples, chosen, binding), *elsewhere]
-    rays = {entry.car for entry in chosen if entry.role is Role.BEARINGS and not given.distorted}
+    frames = {s.car: s.stated.frame for s in samples if s.role is Role.DETECTIONS and s.stated.frame}
+    mountings = odd_mountings(tree, frames, {car.name: car.names["body"] for car in given.cars}, cameras)
+    notes += [*_turn_notes(samples, chosen, binding), *elsewhere, *mountings]
+    rays = placed | {entry.car for entry in chosen if entry.role is Role.BEARINGS and not given.distorted}
     pixels = {name: lens for name, lens in lenses.items() if name not in rays}
     added: dict[tuple[str, Role], tuple[str, float]] = {}
     sent = {
@@ -391,7 +425,8 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         moved = (moves.get(topic, 0) + (shift.added if shift else 0)) / NS + given.clocks.leads.get(topic, 0.0)
         added.setdefault((track.chosen.car, track.chosen.role), (topic, moved))
     rows = rows_of(files, chosen, samples, clocks, tracks, leads)
-    return BagLog(samples, rows, tuple(notes), pixels, added, unknown, sent)
+    stating = {car: about for car, (_, about) in published.items()}
+    return BagLog(samples, rows, tuple(notes), pixels, added, unknown, sent, cameras=stating)
 
 
 def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:
@@ -407,13 +442,13 @@ def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:
 
 def _samples(tracks: Sequence[Track], clocks: Clocks, moves: Mapping[str, int]) -> tuple[Sample, ...]:
     """Return the samples, each once, in the order of their stamps, to which `moves` are added by topic, ns."""
-    found: dict[tuple[str, int], Sample] = {}
+    found: dict[tuple[Chosen, int], Sample] = {}
     for track in tracks:
         added, recorder = clocks.shifts.get(track.source), clocks.recorders[track.file]
         moved = moves.get(track.chosen.topic, 0)
         for entry in track.entries:
             time = entry.stamp + added.added + moved if entry.stamp and added else entry.received + recorder
-            found.setdefault((track.chosen.topic, time), replace(entry, stamp=time, received=time))
+            found.setdefault((track.chosen, time), replace(entry, stamp=time, received=time))
     return tuple(sorted(found.values(), key=lambda sample: sample.stamp))
 
 

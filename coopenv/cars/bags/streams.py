@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import apsw
+import zstandard
 
 from coopenv.base.errors import regular
 from coopenv.cars.bags.definitions import ROS1, BagChannel
+from coopenv.cars.bags.reader import in_reader
 from coopenv.sources import mcap_container as container
 from coopenv.sources.mcap_container import Allowance, TooLargeError, messages_of, records_of
 from coopenv.sources.mcap_format import MAGIC, is_cut_off
@@ -23,6 +25,8 @@ from coopenv.sources.mcap_format import MAGIC, is_cut_off
 ENDS_EARLY = "its end is missing"
 ZSTD = b"\x28\xb5\x2f\xfd"
 """Begin of a packed message; a message of CDR begins with 0."""
+WHOLE = BagChannel("", "", "zstd")
+"""Channel of the blocks of a packed file."""
 MOST_CHANNELS = 2**16  # as many as an MCAP file has numbers for
 EXPANSION = {".mcap": 1000, ".db3": 200, ".bag": 200}
 """Times that a bag may grow when it is unpacked: dark frames and empty maps, which no car needs, pack well."""
@@ -44,37 +48,48 @@ class Part:
         """Why it is read no further than it is."""
         self.counts: Counter[BagChannel] = Counter()
         """Messages of every channel."""
-        for channel, received, data in self._entries():
-            self.counts[channel] += data is not None
-            if data is not None and received:  # 0: before the recorder's clock was set
-                self.start_time, self.end_time = min(self.start_time, received), max(self.end_time, received)
+        try:
+            for channel, received, data in in_reader(self._without_contents, path.stat().st_size):
+                self.counts[channel] += data is not None
+                if data is not None and received:  # 0: before the recorder's clock was set
+                    self.start_time, self.end_time = min(self.start_time, received), max(self.end_time, received)
+                if len(self.counts) > MOST_CHANNELS:
+                    raise TooLargeError(f"has more than {MOST_CHANNELS} topics")
+        except TooLargeError:
+            raise
+        except Exception as error:  # any error of the libraries at a truncated file
+            self.error = error
 
     def messages(self, wanted: Collection[BagChannel]) -> Iterator[tuple[BagChannel, int, bytes]]:
-        """Yield channel, time of reception (ns) and bytes of the messages of some channels.
+        """Yield channel, time of reception (ns) and bytes of the messages of some channels, up to a damaged part.
 
         Raises TooLargeError: the messages take too much memory.
         """
         allowance, growth = Allowance(self.path.stat().st_size, self._growth), self._growth
-        for channel, received, data in self._entries():
-            if data is not None and channel in wanted:
-                allowance.take(round(IN_MEMORY * growth))
-                yield channel, received, _unpacked(data, allowance) if data[:4] == ZSTD else data
+        try:
+            for channel, received, data in self._entries():
+                if data is not None and channel in wanted:
+                    allowance.take(round(IN_MEMORY * growth))
+                    yield channel, received, _unpacked(data, allowance) if data[:4] == ZSTD else data
+        except (MemoryError, TooLargeError):
+            raise
+        except Exception:  # as it was noted when the file was opened
+            return
+
+    def _without_contents(self) -> Entries:
+        return ((channel, received, data and b"") for channel, received, data in self._entries())
 
     def _entries(self) -> Entries:
-        """Yield messages up to where the file makes no sense."""
+        """Yield messages up to where the file makes no sense. Raises any error of the libraries."""
         allowance, growth = Allowance(self.path.stat().st_size, self._growth), self._growth
         try:
             for entry in FORMS[self.path.suffix](self.path, allowance):
                 allowance.take(round(OVERHEAD * growth))
-                if len(self.counts) > MOST_CHANNELS:
-                    raise TooLargeError(f"has more than {MOST_CHANNELS} topics")
                 yield entry
-            if self.path.suffix == ".mcap" and is_cut_off(self.path):
-                raise EOFError(ENDS_EARLY)
-        except (TooLargeError, apsw.TooBigError) as error:
+        except apsw.TooBigError as error:
             raise TooLargeError(str(error)) from None
-        except Exception as error:  # any error of the libraries at a truncated file
-            self.error = error
+        if self.path.suffix == ".mcap" and is_cut_off(self.path):
+            raise EOFError(ENDS_EARLY)
 
 
 def _unpacked(data: bytes, allowance: Allowance) -> bytes:
@@ -85,6 +100,15 @@ def _unpacked(data: bytes, allowance: Allowance) -> bytes:
         raise
     except Exception:  # any error of the library at malformed bytes
         return b""
+
+
+def blocks_of(path: Path) -> Entries:
+    """Yield the blocks of a packed file. Raises TooLargeError; other errors are the library's."""
+    allowance = Allowance(path.stat().st_size)
+    with regular(path).open("rb") as packed:
+        for block in zstandard.ZstdDecompressor().read_to_iter(packed):
+            allowance.take(len(block))
+            yield WHOLE, 0, block
 
 
 def _channel(topic: bytes, kind: bytes, encoding: str, language: str = "", definition: bytes = b"") -> BagChannel:

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -18,6 +18,7 @@ from coopenv.cars.settings.profile import (
     AUTHORS,
     PREFIX,
     SVEA,
+    TRANSFORMS,
     VELOCITY,
     CarProfile,
     Role,
@@ -54,7 +55,8 @@ class Topics(Section):
 
     detections: TopicName | None = None
     """pixy_camera/ObjectInfoArrayStamped: blocks in pixels; sensor_msgs/Image or CompressedImage: frames with tags;
-    apriltag_msgs or apriltag_ros/AprilTagDetectionArray, vision_msgs/Detection2DArray, aruco_msgs/MarkerArray,
+    apriltag_msgs, apriltag_ros or isaac_ros_apriltag_interfaces/AprilTagDetectionArray, vision_msgs/Detection2DArray
+    or Detection3DArray, aruco_msgs/MarkerArray, aruco_opencv_msgs/ArucoDetection, ros2_aruco_interfaces/ArucoMarkers,
     fiducial_msgs/FiducialArray or FiducialTransformArray, ar_track_alvar_msgs/AlvarMarkers, or the authors'
     ArucoArray."""
     bearings: TopicName | None = None
@@ -62,7 +64,7 @@ class Topics(Section):
     camera_info: TopicName | None = None
     """sensor_msgs/CameraInfo: calibration, instead of the environment's."""
     wheel: TopicName | None = None
-    """geometry_msgs/TwistWithCovarianceStamped, TwistStamped or nav_msgs/Odometry: body twist by the wheels."""
+    """geometry_msgs/TwistWithCovarianceStamped, TwistStamped, Twist or nav_msgs/Odometry: body twist by the wheels."""
     imu: TopicName | None = None
     """sensor_msgs/Imu: turn rate, instead of the wheels'."""
     odometry: TopicName | None = None
@@ -77,8 +79,8 @@ class Topics(Section):
     command: TopicName | None = None
     """ackermann_msgs/AckermannDriveStamped: commands to the car, for `identify` where there is no `manual`."""
     truth: TopicName | None = None
-    """geometry_msgs/PoseStamped, PoseWithCovarianceStamped or nav_msgs/Odometry: motion capture, for errors
-    only, never observed."""
+    """geometry_msgs/PoseStamped, PoseWithCovarianceStamped, TransformStamped, nav_msgs/Odometry, or transforms (`/tf`)
+    of the frame `body`: motion capture, for errors only, never observed."""
 
     @property
     def given(self) -> dict[Role, str]:
@@ -93,11 +95,14 @@ UNNEEDED = (Role.CAMERA_INFO, Role.TRUTH, *COMMANDS)
 """Roles without which there are ticks."""
 
 
+FrameName = Annotated[str, Field(max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_/]*$")]
+
+
 class BagCar(Car):
     """One car of the bag."""
 
-    body: Name | None = None
-    """Name of the car in motion capture (default: its name)."""
+    body: FrameName | None = None
+    """Name of the car in motion capture, or its frame in transforms (default: its name)."""
     topics: Topics = Topics()
 
     @property
@@ -233,6 +238,7 @@ class Chosen:
     car: str
     role: Role
     leads: bool = False  # whether the car is a moving landmark
+    frame: str = ""  # of its body, if the topic has transforms
 
     @property
     def sample_role(self) -> Role:
@@ -266,9 +272,9 @@ def select(given: TopicMap, topics: Mapping[str, str], where: str) -> list[Chose
     Raises:
         DataError: a needed topic is absent, or holds messages that cannot be read in the role of the map.
     """
-    found: dict[str, Chosen] = {}
+    found: dict[tuple[str, str], Chosen] = {}
     for entry in (entry for car in given.cars for entry in _of_car(given, car, topics, where)):
-        if (other := found.setdefault(entry.topic, entry)) is not entry:
+        if (other := found.setdefault((entry.topic, entry.frame), entry)) is not entry:
             both = f"cars.{other.car}.topics.{other.role} and cars.{entry.car}.topics.{entry.role}"
             raise DataError(f"{given.path.name}: {both} are one topic, {entry.topic}")
     return [*found.values()]
@@ -300,8 +306,9 @@ def _of_car(given: TopicMap, car: BagCar, topics: Mapping[str, str], where: str)
             raise DataError(f"{table}.{role}: {absent(name)}{hint}")
     found = {role: there[0] for role, some in names.items() if (there := [name for name in some if name in topics])}
     for role, name in found.items():
-        if topics[name] not in READERS.get(role, topics.values()):
-            kinds = f"{topics[name] or 'several types'}, {role} is one of {listed(list(READERS[role]))}"
+        readable = [*READERS.get(role, topics.values()), *(TRANSFORMS if role is Role.TRUTH else ())]
+        if topics[name] not in readable:
+            kinds = f"{topics[name] or 'several types'}, {role} is one of {listed(readable)}"
             raise DataError(f"{where}: topic {name} of {car.name} holds {kinds}")
     if car.landmark:  # motion capture is its position where it publishes none
         chosen: tuple[Role, ...] = first("position", [(role,) for role in (Role.ESTIMATE, Role.POINT, Role.TRUTH)])
@@ -311,4 +318,5 @@ def _of_car(given: TopicMap, car: BagCar, topics: Mapping[str, str], where: str)
         chosen = first("odometry", twists) + first("camera", [(role,) for role in cameras])
         found.pop(Role.COMMAND if Role.MANUAL in found else Role.MANUAL, None)
         chosen += tuple(role for role in UNNEEDED if role in found)
-    return [Chosen(found[role], car.name, role, car.landmark is not None) for role in chosen]
+    frames = {role: car.names["body"] if topics[found[role]] in TRANSFORMS else "" for role in chosen}
+    return [Chosen(found[role], car.name, role, car.landmark is not None, frames[role]) for role in chosen]

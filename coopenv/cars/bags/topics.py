@@ -5,16 +5,15 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import islice
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError, listed, printable
+from coopenv.base.errors import CoopenvError, printable
 from coopenv.cars.backend.assembler import BROADCAST
 from coopenv.cars.bags.clocks import checked
 from coopenv.cars.bags.files import BagFile
-from coopenv.cars.bags.topic_map import READ, Chosen, TopicMap
-from coopenv.cars.messages.readings import POSES, READERS, read
+from coopenv.cars.bags.topic_map import READ
+from coopenv.cars.messages.readings import POSES, READERS, UNSTAMPED, read
 from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.profile import IMAGES, SVEA, VELOCITY, Role
 from coopenv.cars.settings.sensors import TOPIC
@@ -145,7 +144,7 @@ def _name(part: str) -> str:
 
 def role_of(row: TopicRow) -> Role | None:
     """Return the role of a topic by its type, and by its name where that leaves several."""
-    if COMMANDED.search(row.topic) or not re.match(TOPIC, row.topic):
+    if COMMANDED.search(row.topic) or not re.match(TOPIC, row.topic) or row.type in UNSTAMPED:
         return None
     if row.type in POSES and CAPTURE.search(row.topic):
         return Role.TRUTH
@@ -163,26 +162,3 @@ def markers_of(files: Sequence[BagFile], used: set[str]) -> Counter[int]:
                 with suppress(CoopenvError):
                     found.update(getattr(read(role, decode(), ANY_CAMERA), "markers", ()))
     return found
-
-
-TRANSFORMS, FIRST = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"), 500
-"""Types of messages with transforms, and how many of them are looked at."""
-
-
-def unread_truth(files: Sequence[BagFile], given: TopicMap, chosen: Sequence[Chosen]) -> Iterator[str]:
-    """Yield a note on the poses that transforms have, of cars of which there is no motion capture."""
-    known = {entry.car for entry in chosen if entry.role is Role.TRUTH}
-    bodies = {car.names["body"] for car in given.cars if car.name not in known}
-    found: dict[str, str] = {}
-    for file in files if bodies else ():
-        trees = [name for name, kind in file.topics.items() if kind in TRANSFORMS]
-        for topic, _, decode in islice(file.messages(trees), FIRST) if trees else ():
-            with suppress(CoopenvError, AttributeError, TypeError, ValueError):  # fields other than ours
-                for part in decode().transforms:
-                    if any(body in part.child_frame_id.split("/") for body in bodies):
-                        found.setdefault(
-                            part.child_frame_id, f"{topic}: {part.header.frame_id} -> {part.child_frame_id}"
-                        )
-    if found:
-        poses = printable(listed(sorted(found.values())))
-        yield f"poses in transforms are not read as motion capture: {poses}; `truth` names a topic of poses"

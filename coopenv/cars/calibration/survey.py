@@ -6,7 +6,6 @@ of the first car at the begin is the origin. A marker whose lines of sight do no
 Source: Hartley and Sturm, Triangulation, Computer Vision and Image Understanding 68(2), 1997 (iterated linear method).
 """
 
-import json
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -26,6 +25,7 @@ from coopenv.cars.calibration.batch import BIAS, CAMERA_TIME, LATE, NUISANCE, RO
 from coopenv.cars.calibration.calibrate import errors
 from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive, drive_of_bag
 from coopenv.cars.settings.profile import Role
+from coopenv.cars.settings.toml import toml_text
 from coopenv.estimation.poses import Array
 from coopenv.scenario import load_scenario
 
@@ -207,8 +207,9 @@ class Room:
     ) -> None:
         """Write starts (C, 3) of the cars, places of landmarks, their markers and those of cars."""
         vehicles = dict(zip(self.cars, starts.tolist(), strict=True))
-        replace_text(self.files[0], environment_text(self.raw, self.title, vehicles, places))
-        replace_text(self.files[1], topics_text(self.title, self.cars, markers, own))
+        first = f"# Proposed from {self.title}.\n"
+        replace_text(self.files[0], first + toml_text(environment_of(self.raw, self.title, vehicles, places)))
+        replace_text(self.files[1], first + toml_text(topics_of(self.cars, markers, own)))
 
 
 def survey(bags: Sequence[Path], like: str, folder: Path, truth: bool = True) -> Survey:
@@ -367,44 +368,28 @@ def same_names(template: Any, numbers: Sequence[int], places: Array) -> dict[int
     return {numbers[k]: marks[m].name for k, m in pairs if apart[k, m] < SAME}
 
 
-def environment_text(
+def environment_of(
     raw: Mapping[str, Any], title: str, cars: Mapping[str, Sequence[float]], places: Mapping[str, Sequence[float]]
-) -> str:
+) -> dict[str, Any]:
     """Return an environment with the sections of another, cars as vehicles at x, y, yaw, and landmarks at places."""
-    lines = [f"title = {json.dumps(f'Drive of {title}')}", f"horizon = {raw['horizon']}"]
-    for name in KEPT:
-        if section := raw.get(name):
-            lines += ["", f"[{name}]", *(f"{key} = {toml_value(value)}" for key, value in section.items())]
-    for name, place in places.items():
-        lines += ["", "[[landmarks]]", f"name = {json.dumps(name)}", f"position = {toml_value(list(place))}"]
-    shared = {
-        key: value
-        for key, value in raw["vehicles"][0].items()
-        if key in ("body", "marker", "initial_estimate") and value
+    kept = ("body", "marker", "initial_estimate")
+    shared = {key: value for key, value in raw["vehicles"][0].items() if key in kept and value}
+    starts = [{"position": [round(x, 4), round(y, 4), 0.0], "yaw": round(yaw, 4)} for x, y, yaw in cars.values()]
+    return {
+        "title": f"Drive of {title}",
+        "horizon": raw["horizon"],
+        **{name: raw[name] for name in KEPT if raw.get(name)},
+        "landmarks": [{"name": name, "position": list(place)} for name, place in places.items()],
+        "vehicles": [{"initial_pose": start, **shared} for start in starts],
     }
-    for name, (x, y, yaw) in cars.items():
-        start = f"{{ position = [{x:.4f}, {y:.4f}, 0.0], yaw = {yaw:.4f} }}"
-        lines += ["", f"[[vehicles]] # {name}", f"initial_pose = {start}"]
-        lines += [f"{key} = {toml_value(value)}" for key, value in shared.items()]
-    return "\n".join(lines) + "\n"
 
 
-def topics_text(
-    title: str, cars: Mapping[str, Mapping[Role, str]], markers: Mapping[str, int], own: Mapping[str, int]
-) -> str:
+def topics_of(
+    cars: Mapping[str, Mapping[Role, str]], markers: Mapping[str, int], own: Mapping[str, int]
+) -> dict[str, Any]:
     """Return a map of topics whose environment stands beside it."""
-    lines = [f"# Proposed from {title}.", 'environment = "environment.toml"', 'names = "none"']
-    lines += [f"markers = {toml_value(markers)}"]
-    for car, topics in cars.items():
-        lines += ["", "[[cars]]", f'name = "{car}"', *([f"marker = {own[car]}"] if car in own else []), "[cars.topics]"]
-        lines += [f'{role.value} = "{topic}"' for role, topic in topics.items()]
-    return "\n".join(lines) + "\n"
-
-
-def toml_value(value: Any) -> str:
-    """Return a value of JSON as TOML, tables in a line; entries without a value are left out."""
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{json.dumps(k)} = {toml_value(v)}" for k, v in value.items() if v is not None) + " }"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(toml_value(entry) for entry in value) + "]"
-    return json.dumps(value)
+    rows = [
+        {"name": car, "marker": own.get(car), "topics": {role.value: topic for role, topic in topics.items()}}
+        for car, topics in cars.items()
+    ]
+    return {"environment": "environment.toml", "names": "none", "markers": markers, "cars": rows}

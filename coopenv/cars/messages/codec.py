@@ -107,7 +107,9 @@ def header(stamp: int, frame: str = "") -> Any:
 
 
 def stamp_of(message: Any) -> int:
-    """Return the stamp in ns of a message with a header, of ROS 1 or 2."""
+    """Return the stamp in ns of a message of ROS 1 or 2; 0: it has no header."""
+    if not hasattr(message, "header"):
+        return 0
     stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 

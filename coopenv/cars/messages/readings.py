@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.cars.gate.wheel_command import MotionCommand
 from coopenv.cars.messages.codec import numbers_after_header
-from coopenv.cars.messages.vision import BEARINGS, FINDERS, Calibration, Tag
+from coopenv.cars.messages.detectors import BEARINGS, FINDERS, PLACED
+from coopenv.cars.messages.stated import NOTHING, Stated, stated
+from coopenv.cars.messages.vision import Calibration, Quality, Tag
 from coopenv.cars.settings.profile import GATE_TYPES, MOST_CHANNELS, CarProfile, Role, VisionSettings
 from coopenv.estimation.poses import Array, log_so3
 from coopenv.observers.contract import Message
@@ -26,6 +28,7 @@ class Detections:
     bearings: Array  # (m, 3) unit vectors camera -> target, optical frame, without the lens's distortion
     dropped: int = 0  # blocks that were left out: second ones of a marker, beyond the image, not finite
     late: int = 0  # ns from the stamp to the exposure's middle
+    qualities: tuple[Quality, ...] = ()  # (m,) as the detector states them; empty: made without a detector
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +70,7 @@ class Sample:
     stamp: int  # ns, clock of the sender
     received: int  # ns, clock of the receiver
     value: Value
+    stated: Stated = NOTHING  # beside the value, untested
 
 
 PLAIN = VisionSettings()
@@ -135,7 +139,8 @@ def tags(
     units = np.array([best[number].ray for number in sorted(best)], dtype=np.float64).reshape(-1, 3)
     rows = [tag.row for tag in found if tag.row is not None]
     late = vision.late(rows, camera.image_size[1]) if camera else 0
-    return Detections(tuple(sorted(best)), units, len(found) - len(best), late)
+    numbers = sorted(best)
+    return Detections(tuple(numbers), units, len(found) - len(best), late, tuple(best[n].quality for n in numbers))
 
 
 LONGEST_MODE = 64  # characters
@@ -166,7 +171,19 @@ def calibration_of(message: Any, rectified: bool = False) -> Calibration:
         projection, bent = numbers_of(getattr(message, "p", getattr(message, "P", ())), "p", 1e6), (0.0,) * 5
         if projection.shape == (12,) and projection.any():
             focal, centre = (float(projection[0]), float(projection[5])), (float(projection[2]), float(projection[6]))
-    return Calibration(size, focal, centre, bent)
+    return _of_image(Calibration(size, focal, centre, bent), stated(message))
+
+
+def _of_image(sensor: Calibration, about: Stated) -> Calibration:
+    """Return the intrinsics of an image by those of the whole sensor, of which it has a region and bins pixels."""
+    left, top, *sides = about.region
+    width, height = sides if all(sides) else sensor.image_size
+    return Calibration(
+        (width // about.binning[0], height // about.binning[1]),
+        (sensor.focal_length[0] / about.binning[0], sensor.focal_length[1] / about.binning[1]),
+        ((sensor.principal_point[0] - left) / about.binning[0], (sensor.principal_point[1] - top) / about.binning[1]),
+        sensor.distortion,
+    )
 
 
 def state_of(message: Any) -> CarStatus:
@@ -188,6 +205,9 @@ def battery_of(message: Any) -> CarStatus:
         raise CoopenvError(f"percentage: {share:g} is not in 0..1")
     return CarStatus(battery=share)
 
+
+OTHER_FIELDS = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+"""Errors of reading a message of a bag whose definition has other fields than ours."""
 
 FARTHEST, FASTEST, SPINNING = 1e7, 200.0, 100.0
 """m, m/s and rad/s beyond which a value is no car's."""
@@ -225,19 +245,21 @@ def read(
             return calibration_of(message, vision.rectified)
         if role not in (Role.DETECTIONS, Role.BEARINGS):
             return readers[kind](message)
-        needed = role is Role.DETECTIONS or distorted
+        needed = kind not in PLACED and (role is Role.DETECTIONS or distorted)
         if needed and calibration is None:
             raise CoopenvError("the camera's calibration is not known")
         settings = vision if role is Role.DETECTIONS else PLAIN  # bearings have their final stamps
         return tags(message, calibration if needed else None, known, settings)
     except CoopenvError as error:
         raise CoopenvError(f"{role}: {error}") from None
+    except OTHER_FIELDS as error:
+        raise CoopenvError(f"{role}: {kind} has other fields than expected ({error})") from None
 
 
-def _twist(message: Any) -> Twist:
-    """Return the velocities of a TwistWithCovarianceStamped or Odometry; a negative variance means not measured."""
-    value = _velocities(message.twist.twist)
-    variances = np.asarray(message.twist.covariance, dtype=np.float64).reshape(6, 6).diagonal()
+def _twist(twist: Any) -> Twist:
+    """Return the velocities of a TwistWithCovariance; a negative variance means not measured."""
+    value = _velocities(twist.twist)
+    variances = np.asarray(twist.covariance, dtype=np.float64).reshape(6, 6).diagonal()
     linear, angular = (None if variances[k] < 0.0 else part for k, part in ((0, value.linear), (5, value.angular)))
     return Twist(linear, angular)
 
@@ -259,12 +281,16 @@ def _turning(message: Any) -> Twist:
     return Twist(None, numbers_of([*across, turning.z], "angular_velocity", SPINNING))
 
 
-def _pose_with_covariance(message: Any) -> CarPose:
-    """Return the pose of a PoseWithCovarianceStamped or Odometry."""
-    return replace(_placed(message.pose.pose), covariance=covariance_of(message.pose.covariance))
+def _pose_with_covariance(pose: Any) -> CarPose:
+    """Return the pose of a PoseWithCovariance."""
+    return replace(placed(pose.pose), covariance=covariance_of(pose.covariance))
 
 
-def _placed(pose: Any) -> CarPose:
+def placed(pose: Any) -> CarPose:
+    """Return the pose of a Pose or a Transform. Raises CoopenvError: it is none."""
+    if hasattr(pose, "translation"):
+        turned = rotation_of(pose.rotation, "transform.rotation")
+        return CarPose(vector(pose.translation, "transform.translation", FARTHEST), turned)
     return CarPose(vector(pose.position, "pose.position", FARTHEST), rotation_of(pose.orientation, "pose.orientation"))
 
 
@@ -272,7 +298,7 @@ def _report(message: Any) -> Message:
     """Return the message of the observer `robust`, see `coopenv.observers.robust.messages`; none: no position."""
     if not message.valid:
         return Message()
-    pose, odometry = _placed(message.pose), message.odometry
+    pose, odometry = placed(message.pose), message.odometry
     moved = vector(odometry.position, "odometry.position", FARTHEST)
     turned = log_so3(rotation_of(odometry.orientation, "odometry.orientation"))
     extra: dict[str, Any] = {
@@ -288,15 +314,22 @@ def _report(message: Any) -> Message:
 
 
 POSES: dict[str, Callable[[Any], Value]] = {
-    "geometry_msgs/msg/PoseStamped": lambda message: _placed(message.pose),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_with_covariance,
-    "nav_msgs/msg/Odometry": _pose_with_covariance,
+    "geometry_msgs/msg/PoseStamped": lambda message: placed(message.pose),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: _pose_with_covariance(message.pose),
+    "nav_msgs/msg/Odometry": lambda message: _pose_with_covariance(message.pose),
+    "geometry_msgs/msg/TransformStamped": lambda message: placed(message.transform),
+    "geometry_msgs/msg/Pose": placed,
+    "geometry_msgs/msg/PoseWithCovariance": _pose_with_covariance,
 }
 TWISTS: dict[str, Callable[[Any], Value]] = {
-    "geometry_msgs/msg/TwistWithCovarianceStamped": _twist,
+    "geometry_msgs/msg/TwistWithCovarianceStamped": lambda message: _twist(message.twist),
     "geometry_msgs/msg/TwistStamped": lambda message: _velocities(message.twist),
-    "nav_msgs/msg/Odometry": _twist,  # in the child frame
+    "nav_msgs/msg/Odometry": lambda message: _twist(message.twist),  # in the child frame
+    "geometry_msgs/msg/Twist": _velocities,
+    "geometry_msgs/msg/TwistWithCovariance": _twist,
 }
+UNSTAMPED = tuple(f"geometry_msgs/msg/{name}{more}" for name in ("Pose", "Twist") for more in ("", "WithCovariance"))
+"""Types without a stamp: in bags the time of reception counts, live cars need stamps."""
 READERS: dict[Role, dict[str, Callable[..., Value]]] = {
     Role.DETECTIONS: {kind: tags for kind in FINDERS if kind != BEARINGS},
     Role.BEARINGS: {BEARINGS: tags},
@@ -323,6 +356,8 @@ def check_types(profile: CarProfile, where: str) -> None:
     for role, readers in READERS.items():
         if (kind := profile.topics[role].type) not in readers:
             raise CoopenvError(f"{where}: profile: topics.{role}.type: {kind} is none of {listed(list(readers))}")
+        if kind in UNSTAMPED:
+            raise CoopenvError(f"{where}: profile: topics.{role}.type: {kind} has no stamp, messages of cars need one")
     kind, written = profile.topics[Role.MANUAL].type, [kind for kind, _ in profile.command.neutral.values()]
     if (numbers := numbers_after_header(kind)) != written:
         has = f"has {listed(numbers)} after its header" if numbers else "is no stamped message of numbers"

@@ -1,7 +1,8 @@
-"""Bearings of a camera: tags (AprilTag, ArUco) or colours in its frames, and the messages of other detectors."""
+"""Tags (AprilTag, ArUco) or colours in the frames of a camera, and their rays through its lens."""
 
+import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any, Literal, NamedTuple, Self
@@ -13,7 +14,6 @@ from scipy.ndimage import map_coordinates
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.base.files import muted_errors
 from coopenv.base.installation import install_command, needing
-from coopenv.cars.settings.profile import IMAGES, VisionSettings
 from coopenv.estimation.lens import distort, undistort
 from coopenv.estimation.poses import Array
 
@@ -66,8 +66,12 @@ def ray_of(calibration: Calibration, u: int, v: int) -> tuple[float, float, floa
     return (x, y, z) if there[0] else None
 
 
-UNIT = 1e-3
-"""Tolerance of the length of a bearing; single precision and rounded decimals are within it."""
+class Quality(NamedTuple):
+    """Quality of a detection as its detector states it, untested; NaN: not stated."""
+
+    margin: float = math.nan  # decision margin of AprilTag: contrast of black and white
+    score: float = math.nan  # 0 to 1
+    hamming: float = math.nan  # bits of the code that were corrected
 
 
 class Tag(NamedTuple):
@@ -77,122 +81,18 @@ class Tag(NamedTuple):
     size: float  # larger ones of the same number are preferred
     ray: Sequence[float] | Array | None  # (3,) unit vector camera -> its centre, optical frame; None: it has none
     row: float | None = None  # of the image
+    quality: Quality = Quality()
 
 
-Find = Callable[[Any, VisionSettings, Any], list[Tag]]
-"""Returns the tags of a message by the Calibration of its camera (None: bearings without distortion).
-
-Raises CoopenvError: it is malformed, or no extra."""
-
-
-def _blocks(message: Any, _settings: VisionSettings, camera: Calibration) -> list[Tag]:
-    """Return the detections of an ObjectInfoArrayStamped; without an area, or outside the image, they have no ray."""
-    found, (width, height) = [], camera.image_size
-    for block in message.objects:
-        u, v, area = int(block.center_x), int(block.center_y), int(block.width) * int(block.height)
-        valid = 0 <= u < width and 0 <= v < height and block.width >= 0 and block.height >= 0
-        found.append(Tag(int(block.signature), area, ray_of(camera, u, v) if valid else None, v if valid else None))
-    return found
-
-
-def _bearings(message: Any, _settings: VisionSettings, camera: Calibration | None) -> list[Tag]:
-    """Return the detections of an ObjectBearingArrayStamped; its vectors point from the target to the camera.
-
-    The authors' node keeps the order of its camera, largest block first. With a camera, distortion was not removed from
-    the pixels of the vectors: then they give back the pixels. Those without length 1 have no ray.
-    """
-    table = np.array([(b.id, b.bearing_x, b.bearing_y, b.bearing_z) for b in message.bearing]).reshape(-1, 4)
-    with np.errstate(all="ignore"):
-        units = -table[:, 1:]
-        lengths = np.linalg.norm(units, axis=-1)
-        there = np.abs(lengths - 1.0) <= UNIT
-        units /= lengths[:, None]
-        if camera is not None:
-            there &= units[:, 2] > 1e-6
-            flat = np.where(there[:, None], units[:, :2] / units[:, 2:], 0.0)
-            pixels = flat * camera.focal_length + np.asarray(camera.principal_point)
-            units, imaged = rays(np.round(pixels, 3), camera)  # of single precision
-            there &= imaged
-    return [Tag(int(n), 0.0, ray if ok else None) for n, ray, ok in zip(table[:, 0], units, there, strict=True)]
-
-
-def _frame(message: Any, settings: VisionSettings, camera: Calibration) -> list[Tag]:
-    """Return the tags, or the blobs of colour, in an Image or CompressedImage."""
-    try:
-        frame = frame_of(message, "BGR" if settings.colours else "GRAY")
-        if frame.shape[1::-1] != camera.image_size:
-            width, height = camera.image_size
-            raise CoopenvError(f"{frame.shape[1]} x {frame.shape[0]} pixels, the camera model has {width} x {height}")
-        if settings.colours:
-            return find_blobs(frame, settings.colours, camera)
-        return find_tags(frame, settings.family, camera)
-    except opencv().error as error:  # such as an odd width of a format that has a colour for two pixels
-        kind = f"{message.width} x {message.height} {message.encoding}" if hasattr(message, "encoding") else "a frame"
-        raise CoopenvError(f"data: OpenCV does not read {kind}: {shown(error.err)}") from None
-
-
-def _apriltags(message: Any, _settings: VisionSettings, camera: Calibration) -> list[Tag]:
-    """Return the detections of an AprilTagDetectionArray; its centres are the projection's.
-
-    AprilTag's library counts pixels from the corner of the first one, CameraInfo from its middle.
-    """
-    found = [
-        (d.id, np.ptp([p.x for p in d.corners]) * np.ptp([p.y for p in d.corners]), d.centre.x - 0.5, d.centre.y - 0.5)
-        for d in message.detections
-    ]
-    return _centred(found, camera)
-
-
-def _boxes(message: Any, _settings: VisionSettings, camera: Calibration) -> list[Tag]:
-    """Return the detections of a Detection2DArray: the class of the best hypothesis is the number."""
-    found = []
-    for detection in message.detections:
-        guesses: list[Any] = [getattr(result, "hypothesis", result) for result in detection.results]
-        named: Any = max(guesses, key=lambda guess: guess.score) if guesses else None
-        label = str(getattr(named, "class_id", getattr(named, "id", "")))
-        if label.isdecimal():
-            box = detection.bbox
-            place = getattr(box.center, "position", box.center)
-            found.append((int(label), box.size_x * box.size_y, place.x, place.y))
-    return _centred(found, camera)
-
-
-def _centred(found: list[tuple[int, float, float, float]], camera: Calibration) -> list[Tag]:
-    """Return tags of number, size, and centre in pixels."""
+def centred_tags(
+    found: list[tuple[int, float, float, float]], camera: Calibration, stated: Sequence[Quality] | None = None
+) -> list[Tag]:
+    """Return tags of number, size, and centre in pixels; `stated` is the quality of each."""
     table = np.array(found, dtype=np.float64).reshape(-1, 4)
     with np.errstate(all="ignore"):  # values that are not finite give no ray
         units, there = rays(table[:, 2:], camera)
-    rows = zip(found, units, there, strict=True)
-    return [Tag(int(n), size, ray if known else None, v if known else None) for (n, size, _, v), ray, known in rows]
-
-
-LISTS = ("arucos", "markers", "transforms", "detections")
-"""Names of what a detector of poses has found, by the type of its message."""
-
-
-def _poses(message: Any, _settings: VisionSettings, _: Calibration) -> list[Tag]:
-    """Return the markers of a message that has their positions in the camera's optical frame; bundles have no number.
-
-    Read are the authors' ArucoArray, aruco_msgs, apriltag_ros, fiducial_msgs and ar_track_alvar_msgs.
-    """
-    found = []
-    entries: Any = next(getattr(message, name) for name in LISTS if hasattr(message, name))
-    for entry in entries:
-        marker = getattr(entry, "marker", entry)
-        numbers = np.atleast_1d(getattr(marker, "fiducial_id", getattr(marker, "id", ())))
-        if len(numbers) == 1:
-            place = _place_of(marker)
-            far = float(np.linalg.norm(place))
-            found.append(Tag(int(numbers[0]), -far, place / far if 0.0 < far < np.inf else None))
-    return found
-
-
-def _place_of(marker: Any) -> Array:
-    """Return the position (3,) of a marker, m: that of a transform, or of a pose with a stamp, a covariance or not."""
-    while hasattr(marker, "pose"):
-        marker = marker.pose
-    place = marker.position if hasattr(marker, "position") else marker.transform.translation
-    return np.array([place.x, place.y, place.z], dtype=np.float64)
+    rows = zip(found, units, there, stated or [Quality()] * len(found), strict=True)
+    return [Tag(int(n), size, ray if ok else None, v if ok else None, q) for (n, size, _, v), ray, ok, q in rows]
 
 
 def diagonals_crossing(corners: Array, ahead: Array) -> Array:
@@ -206,46 +106,6 @@ def diagonals_crossing(corners: Array, ahead: Array) -> Array:
     centre = np.cross(first, second)
     centre /= np.linalg.norm(centre, axis=-1, keepdims=True) * np.sign((centre * ahead).sum(axis=-1))[:, None]
     return np.asarray(centre)
-
-
-def _corners(message: Any, _settings: VisionSettings, camera: Calibration) -> list[Tag]:
-    """Return the markers of a FiducialArray, which has the pixels of corners: the ray is where diagonals intersect."""
-    pixels = np.array(
-        [[(getattr(f, f"x{n}"), getattr(f, f"y{n}")) for n in range(4)] for f in message.fiducials], np.float64
-    ).reshape(-1, 4, 2)
-    with np.errstate(all="ignore"):  # values that are not finite give no ray
-        corners, there = rays(pixels.reshape(-1, 2), camera)
-        corners = corners.reshape(-1, 4, 3)
-        centre = diagonals_crossing(corners, corners.sum(axis=1))
-    whole = np.asarray(there.reshape(-1, 4).all(axis=-1) & np.isfinite(centre).all(axis=-1))
-    areas = np.ptp(pixels, axis=1).prod(axis=-1)
-    rows = zip(message.fiducials, areas, centre, pixels[..., 1].mean(axis=-1), whole, strict=True)
-    return [Tag(int(f.fiducial_id), area, ray if ok else None, row if ok else None) for f, area, ray, row, ok in rows]
-
-
-BEARINGS = "pixy_camera/msg/ObjectBearingArrayStamped"
-FINDERS: dict[str, Find] = {
-    "pixy_camera/msg/ObjectInfoArrayStamped": _blocks,
-    BEARINGS: _bearings,
-    **dict.fromkeys(IMAGES, _frame),
-    "apriltag_msgs/msg/AprilTagDetectionArray": _apriltags,
-    "vision_msgs/msg/Detection2DArray": _boxes,
-    "fiducial_msgs/msg/FiducialArray": _corners,
-    **dict.fromkeys(
-        (
-            "aruco_msgs/msg/MarkerArray",
-            "apriltag_ros/msg/AprilTagDetectionArray",
-            "apriltags_ros/msg/AprilTagDetectionArray",
-            "apriltags2_ros/msg/AprilTagDetectionArray",
-            "ar_track_alvar_msgs/msg/AlvarMarkers",
-            "fiducial_msgs/msg/FiducialTransformArray",
-            "svea_thesis/msg/ArucoArray",
-            "svea_msgs/msg/ArucoArray",
-        ),
-        _poses,
-    ),
-}
-"""Decoders by the type of the message."""
 
 
 @cache
@@ -329,7 +189,7 @@ def find_blobs(frame: NDArray[np.uint8], colours: Mapping[int, tuple[float, floa
         _, _, boxes, means = cv2.connectedComponentsWithStats(mask)
         rows = zip(boxes[1:, cv2.CC_STAT_AREA], means[1:], strict=True)  # the first one is the background
         found += [(number, area, x, y) for area, (x, y) in rows if area >= FEWEST]
-    return _centred(found, camera)
+    return centred_tags(found, camera)
 
 
 @cache

@@ -118,8 +118,10 @@ class RemotePulses(Section):
     """Longest pulse that is a signal."""
 
 
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+IMAGE, COMPRESSED = IMAGES = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 """Types of a camera's frames."""
+TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+"""Types of messages with transforms between frames."""
 
 Hue = Annotated[float, Field(ge=0.0, le=360.0)]
 
