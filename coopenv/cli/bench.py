@@ -104,6 +104,7 @@ class ObserverOptions:
     start: options.From = None
     until: options.Until = None
     robots: options.Robots = None
+    trust: options.Trust = None
     basin: Annotated[int, typer.Option(min=0, help="Random initial estimates for maps of the basins.")] = 0
     overrides: options.Overrides = None
     steady_from: options.SteadyFrom = None
@@ -135,7 +136,7 @@ class ObserverOptions:
         from coopenv.sources.selection import Selection
 
         changes = options.parse_overrides(self.overrides)
-        chosen = Selection.of(self.start, self.until, self.robots)
+        chosen = Selection.of(self.start, self.until, self.robots, self.trust or ())
         source = find_source(self.source, changes, self.data, self.topics, self.faults or (), self.policy, chosen)
         source = with_sensor_sets(source) if self.sensors else source
         seeds = range(self.first, self.first + (self.seeds or SEEDS)) if self.seeds or self.first else None

@@ -97,6 +97,10 @@ Robots = Annotated[
 TopicMap = Annotated[
     Path | None, typer.Option("--map", help="TOML file with the map of a ROS bag's topics (docs/bags.md).")
 ]
+Trust = Annotated[
+    list[str] | None,
+    typer.Option("--trust", help="Topic of a ROS bag that is used unchanged although other streams contradict; `all`."),
+]
 Connect = Annotated[
     str | None,
     typer.Option(help="Endpoint of the network in place of the deployment's network.connect.", show_default=False),
@@ -142,13 +146,14 @@ class SourceOptions:
     start: From = None
     until: Until = None
     robots: Robots = None
+    trust: Trust = None
 
     @property
     def selection(self) -> Selection:
         """The part of recorded data that is used."""
         from coopenv.sources.selection import Selection
 
-        return Selection.of(self.start, self.until, self.robots)
+        return Selection.of(self.start, self.until, self.robots, self.trust or ())
 
     @property
     def files(self) -> dict[str, Any]:

@@ -171,6 +171,7 @@ def run(
     start: float | None = None,
     until: float | None = None,
     robots: Sequence[str | int] | None = None,
+    trust: Sequence[str] = (),
     device: str = "cpu",
     dtype: str = "float64",
 ) -> "Results":
@@ -194,6 +195,7 @@ def run(
         start: begin of the part of recorded data that is used, s.
         until: its end, s.
         robots: recorded robots that are used, by name or number; None: all.
+        trust: topics of a ROS bag that are used although other streams contradict, see `coopenv doctor`.
         device: "cpu" or a CUDA device.
         dtype: "float32" or "float64".
 
@@ -201,7 +203,7 @@ def run(
         CoopenvError: an argument is not valid, or the results cannot be written.
     """
     changes, log = with_observer(overrides, observer), Terminal(stderr=True)
-    chosen = Selection.of(start, until, robots)
+    chosen = Selection.of(start, until, robots, trust)
     backend = open_backend(environment, None, changes, chosen, data=data, variant=variant, topics=topics)
     with compile_notice(log):
         made = Rollout(backend.scenario, checked_seed(seed), steps, dtype, device, policy, backend)

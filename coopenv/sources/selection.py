@@ -1,4 +1,4 @@
-"""The part of recorded data that is used: an interval of time and some of the robots."""
+"""The part of recorded data that is used: an interval of time, some robots, and streams that others contradict."""
 
 from __future__ import annotations
 
@@ -27,15 +27,24 @@ class Selection:
     """Time of the last tick in the recorded data, s; None: their end."""
     robots: tuple[str, ...] | None = None
     """Names, such as vehicle_1; None: all."""
+    trust: tuple[str, ...] = ()
+    """Topics of a ROS bag that are used although other streams contradict."""
 
     @classmethod
-    def of(cls, start: float | None, until: float | None, robots: Sequence[str | int] | str | int | None) -> Selection:
+    def of(
+        cls,
+        start: float | None,
+        until: float | None,
+        robots: Sequence[str | int] | str | int | None,
+        trust: Sequence[str] = (),
+    ) -> Selection:
         """Return a checked selection.
 
         Args:
             start: begin, s.
             until: end, s.
             robots: names or numbers, 1 for vehicle_1; a text has commas between them.
+            trust: topics of a ROS bag, or `all`.
 
         Raises:
             CoopenvError: times are not in order, or there are no robots.
@@ -51,13 +60,19 @@ class Selection:
         names = None if given is None else tuple(dict.fromkeys(_robot_name(robot) for robot in given))
         if names is not None and ("" in names or not names):
             raise CoopenvError(f"robots: expected names or numbers such as 1,3, got {shown(robots)}")
-        return cls(start, until, names)
+        return cls(start, until, names, (trust,) if isinstance(trust, str) else tuple(trust))
 
     @property
     def given(self) -> dict[str, Any]:
         """Selected values by option."""
         values = {"from": self.start, "until": self.until, "robots": self.robots and ",".join(self.robots)}
+        values["trust"] = ", ".join(self.trust) or None
         return {option: value for option, value in values.items() if value is not None}
+
+    @property
+    def remark(self) -> str:
+        """Words for titles and tables on the streams that are trusted; empty: none is."""
+        return f" (trusted: {', '.join(self.trust)})" if self.trust else ""
 
     def applied(self, recording: Recording, where: str) -> Recording:
         """Return the selected part of a recording, whose name is for errors.
@@ -70,6 +85,8 @@ class Selection:
         """
         if not self.given:
             return recording
+        if self.trust:
+            raise DataError(f"{where}: trust: is for ROS bags")
         from coopenv.sources.worlds import of_robots, stretch
 
         names = [setup.name for setup in recording.setups]

@@ -293,7 +293,7 @@ def find_source(
         if holds:
             raise CoopenvError(reason)
     if ticks:
-        return Bags(path.stem, path, topic_map, dict(overrides or {}), selection, added=added)
+        return Bags(path.stem + selection.remark, path, topic_map, dict(overrides or {}), selection, added=added)
     if kind.comparison:
         made: RecordSource = call(kind.comparison, str(text), folder, selection)
         return made

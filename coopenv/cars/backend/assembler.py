@@ -9,7 +9,7 @@ tick's `bearing_age`.
 
 import time
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice, takewhile
@@ -260,15 +260,21 @@ class TopicClock:
         return ", ".join([*parts, f"{self.dropped} of {self.taken} stamps dropped"])
 
 
-def measured_clocks(transport: Transport, fleet: Deployment, car: str, seconds: float) -> dict[str, TopicClock]:
-    """Return the clocks of the topics that a fleet's station reads of a car, by the messages of some time, s."""
-    profile, leads, arrivals = fleet.profile, fleet.sensors.leads, list[Arrival]()
-    types = {profile.topic_of(car, role): profile.topics[role].type for role in fleet.sensors.roles}
-    for topic in types:
-        transport.subscribe(topic, arrivals.append)
+def arrivals_of(transport: Transport, fleet: Deployment, car: str, seconds: float) -> list[Arrival]:
+    """Return the messages of some time, s, on the topics that a fleet's station reads of a car."""
+    arrivals = list[Arrival]()
+    for role in fleet.sensors.roles:
+        transport.subscribe(fleet.profile.topic_of(car, role), arrivals.append)
     time.sleep(seconds)
+    return sorted(arrivals[:], key=lambda arrival: arrival.received)
+
+
+def measured_clocks(arrivals: Sequence[Arrival], fleet: Deployment, car: str) -> dict[str, TopicClock]:
+    """Return the clocks of the topics that a fleet's station reads of a car, by messages in order of reception."""
+    profile, leads = fleet.profile, fleet.sensors.leads
+    types = {profile.topic_of(car, role): profile.topics[role].type for role in fleet.sensors.roles}
     clocks = {topic: TopicClock() for topic in types}
-    for arrival in sorted(arrivals[:], key=lambda arrival: arrival.received):
+    for arrival in arrivals:
         topic = arrival.topic
         with suppress(CoopenvError):
             stamp = stamp_of(decode(arrival.payload, types[topic])) + round(leads.get(f"/{topic}", 0.0) / NS)

@@ -17,11 +17,12 @@ from coopenv.cars.backend.buffers import ROLES, StatusBoard
 from coopenv.cars.backend.recorded_drive import PRESENCE, DriveRecorder, RecordedTransport, head_of
 from coopenv.cars.backend.station import UNTRIED, Gates, Pacer, Station
 from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog, bearing_nis, since
-from coopenv.cars.bags.turning import TurnMonitor
+from coopenv.cars.doctor.finding import Finding
+from coopenv.cars.doctor.live import StreamMonitor, examined
 from coopenv.cars.gate.wheel_command import MotionCommand
 from coopenv.cars.link.connect import open_transport
 from coopenv.cars.link.keys import Signer, Verifier, load_keys
-from coopenv.cars.link.transport import ReceivingTransport, Transport
+from coopenv.cars.link.transport import Arrival, ReceivingTransport, Transport
 from coopenv.cars.messages.codec import encode, make, warm_up
 from coopenv.cars.messages.readings import Sample
 from coopenv.cars.messages.v2x import estimate_message, report_message
@@ -101,7 +102,8 @@ class Svea:
         self.station = Station(transport, self.intake.topics, verifier, signers)
         self.gates = Gates(transport, cars, deployment.limits, signer, verifier, profile, zenoh)
         self.board = StatusBoard(transport, cars, deployment.remote, deployment.conditions, profile)
-        self.monitor, self._turns = LinkMonitor(deployment.safety.judge), TurnMonitor(binding)
+        self.monitor = LinkMonitor(deployment.safety.judge)
+        self._streams = StreamMonitor(binding, deployment.sensors.trust)
         self.watchdog = Watchdog(
             *(deployment.safety, self.station, self.gates, self.monitor, cars, others, self._odometry),
             *(1.0 / self.scenario.rates.decision, self.board.happened, self._write_down),
@@ -127,6 +129,7 @@ class Svea:
         gc.collect()  # now, as that would take longer than a decision may
         gc.freeze()  # what is left is not looked through again while cars drive
         if self.deployment.fakes:
+            self._streams.begin()
             signed = ((seed or 0) + 2**63) % 2**64 - 2**63  # the same 64 bits
             self._transport.publish(RESET_TOPIC, encode(make("std_msgs/msg/Int64", data=signed)), reliable=True)
             self._clock.sleep(SETTLE)  # they go to the start of the seed
@@ -188,8 +191,9 @@ class Svea:
             right = self.deployment.sensors.corrections.get(car)
             own = self.board.obstacles(car, safety.min_battery, self.intake.calibrations[car], right)
             yield from ((car, why) for why in own)
-            if why := self._turns.contradiction(car):
+            if why := self._streams.contradiction(car):
                 yield car, f"its turn rate {why}"
+            yield from ((car, str(finding)) for finding in self._streams.findings() if finding.car == car)
         if safety.judge == "truth":  # estimates are not known before cars drive
             yield from self.watchdog.misplaced()
 
@@ -219,8 +223,8 @@ class Svea:
         now = self.pacer.now()
         for name, i in self._local.items():
             sent = MotionCommand(float(command.steering[i]), float(command.speed[i]))
-            self._turns.put(Sample(name, Role.COMMAND, now, now, sent))
-            if why := self._turns.contradiction(name):
+            self._streams.put(Sample(name, Role.COMMAND, now, now, sent))
+            if why := self._streams.contradiction(name):
                 text = f"{name}: its turn rate {why}"
                 if self._armed:
                     self.watchdog.stop(text, name)
@@ -237,7 +241,7 @@ class Svea:
             for sample in self.intake.samples(arrival):
                 if self._assembler.put(sample):
                     self.monitor.put(sample)
-                    self._turns.put(sample)
+                    self._streams.put(sample)
         self.monitor.looked = self.pacer.now()
 
     def _counted(self, tick: Sensed) -> Sensed:
@@ -406,6 +410,16 @@ def scenario_of(deployment: Deployment, environment: str | None, overrides: Mapp
             if str(of_the_file).startswith("override"):
                 raise CoopenvError(f"{file}: {str(of_the_file).replace(OVERRIDES, 'overrides', 1)}") from None
         raise error
+
+
+def examined_arrivals(arrivals: Sequence[Arrival], fleet: Deployment) -> list[Finding]:
+    """Return the streams of a fleet's cars that others contradict, by messages in the order of their reception."""
+    scenario = scenario_of(fleet, None, {})
+    binding = bind(scenario, fleet.cars, fleet.markers, fleet.file.name, None, fleet.profile)
+    intake = Intake(binding, fleet.sensors)
+    samples = [sample for arrival in arrivals for sample in intake.samples(arrival)]
+    found = examined(sorted(samples, key=lambda sample: sample.stamp), binding, fleet.sensors.trust)
+    return [finding for some in found.values() for finding in some]
 
 
 def _types(binding: Binding, identity: str) -> dict[str, str]:

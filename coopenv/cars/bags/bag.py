@@ -14,15 +14,15 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning, check_one_of, listed
 from coopenv.cars.backend.assembler import Assembler
-from coopenv.cars.backend.binding import OPTIONS, bind, marker_places, reset_options
-from coopenv.cars.bags.clocks import misfit_of_truth
+from coopenv.cars.backend.binding import OPTIONS, bind, reset_options
 from coopenv.cars.bags.files import check_extra
 from coopenv.cars.bags.log import read_log
 from coopenv.cars.bags.topic_map import UNNEEDED, TopicMap, load_map
 from coopenv.cars.bags.topics import NS
-from coopenv.cars.messages.readings import CarPose, Sample
+from coopenv.cars.doctor.finding import Treatment
+from coopenv.cars.doctor.streams import Streams
+from coopenv.cars.messages.readings import Sample
 from coopenv.cars.settings.profile import Role
-from coopenv.estimation.poses import MISFIT_DEG
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.sources.base import Capabilities, TickGenerator, TickStream
 from coopenv.sources.selection import WHOLE, Selection
@@ -32,9 +32,6 @@ AHEAD = 100_000_000
 """ns by which motion capture is read ahead of a tick, so that the truth lies between two of its poses."""
 
 LONGEST_GAP = 600.0  # s without any message that is needed
-
-FAR = 10.0
-"""Times the extent of the landmarks, beyond which motion capture is warned of."""
 
 OFF = 0.1
 """Share by which the rate of a camera may differ from the environment's without a warning."""
@@ -70,6 +67,7 @@ class Bag(TickGenerator):
         start: float = 0.0,
         until: float | None = None,
         robots: Sequence[str] | None = None,
+        trust: Sequence[str] = (),
     ) -> None:
         """Read bags.
 
@@ -80,6 +78,7 @@ class Bag(TickGenerator):
             start: time of tick 0 after that of the whole bag, s.
             until: time of the last tick after that, s; None: as long as there is data.
             robots: cars that are used, by their names or those of their vehicles; None: all.
+            trust: subjects of findings that are used unchanged, after those of the map.
 
         Raises:
             TopicMapError: the map is not valid.
@@ -87,7 +86,8 @@ class Bag(TickGenerator):
             CoopenvError: the environment or an override is not valid, or the extra is not installed.
         """
         check_extra()
-        self.map = topics if isinstance(topics, TopicMap) else load_map(topics)
+        given = topics if isinstance(topics, TopicMap) else load_map(topics)
+        self.map = given.model_copy(update={"trust": (*given.trust, *trust)})
         self.changes = changes = {**ENDLESS, **self.map.overrides, **(overrides or {})}
         changes |= self._decisions(changes)
         self.where = ", ".join(str(path) for path in paths)
@@ -102,11 +102,13 @@ class Bag(TickGenerator):
         self.log = read_log([Path(path) for path in paths], self.map.model_copy(update={"cars": read}), self.binding)
         self._begin, ticks = self._ticks(start, until)
         scenario = without_robots(self._scenario(changes, ticks), self.kept)
+        if remark := Selection(trust=self.map.trust).remark:
+            scenario = scenario.model_copy(update={"title": scenario.title + remark})
         self.binding = replace(self.binding, scenario=scenario)
         known = any(sample.role is Role.TRUTH for sample in self.log.samples)
         here = self.kept if robots is not None else None
         super().__init__(scenario, Capabilities(known, False, False, ticks, False, True, here))
-        for note in (*self.log.notes, *self._odd_rates(), *self._odd_markers(), *self._far_truth()):
+        for note in (*self.log.notes, *self._odd_rates(), *self._odd_markers(), *map(str, self.log.findings)):
             warnings.warn(f"{self.where}: {note}", DataWarning, stacklevel=2)
 
     def _decisions(self, changes: Mapping[str, Any]) -> dict[str, float]:
@@ -169,23 +171,6 @@ class Bag(TickGenerator):
                 hint = f'set overrides = {{ "rates.camera" = {float(f"{row.rate:.3g}")} }} in the map'
                 yield f"{row.topic}: {row.rate:.1f} frames per second, the environment has {self._rate:g}: {hint}"
 
-    def _far_truth(self) -> Iterator[str]:
-        """Yield the cars whose motion capture is far from all landmarks, or does not fit to their bearings."""
-        places, hint = marker_places(self.scenario.landmarks)[:, :2], "are its unit (m) and frames.truth right?"
-        width = float(np.linalg.norm(np.ptp(places, axis=0))) if len(places) else 0.0
-        for car in self.binding.cars if width > 0.0 else ():
-            found = [s.value for s in self.log.samples if (s.car, s.role) == (car, Role.TRUTH)]
-            at = np.array([value.position[:2] for value in found if isinstance(value, CarPose)]).reshape(-1, 1, 2)
-            away = float(np.median(np.linalg.norm(at - places, axis=-1).min(axis=-1))) if len(at) else 0.0
-            misfit, topic = misfit_of_truth(self.log.samples, car, self.binding), f"motion capture of {car}"
-            if topics := [row.topic for row in self.log.rows if (row.car, row.role) == (car, Role.TRUTH.value)]:
-                topic += f", topic {topics[0]},"
-            if away > FAR * width:
-                yield f"{topic} is {away:.3g} m from landmarks that span {width:.3g} m: {hint}"
-            elif misfit > MISFIT_DEG:
-                why = "are its heading (rad), unit (m) and frames.truth right, and the markers?"
-                yield f"{topic} is {misfit:.0f} deg off the bearings to landmarks (median): {why}"
-
     def _odd_markers(self) -> Iterator[str]:
         """Yield which markers of the map were never detected, and how often others were."""
         names, found = self.scenario.target_names, set[int]()
@@ -201,9 +186,23 @@ class Bag(TickGenerator):
             counts = [f"{number} ({count} times)" for number, count in sorted(others.items())]
             yield f"detected markers that are not in the map: {listed(counts)}"
 
+    @property
+    def streams(self) -> Streams:
+        """Every stream once, on one clock."""
+        assert self.log.streams is not None
+        return replace(self.log.streams, binding=self.binding)
+
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> TickStream:
-        """Go through the bags tick by tick; the option `arm` has no effect."""
+        """Go through the bags tick by tick; the option `arm` has no effect.
+
+        Raises:
+            DataError: streams contradict each other in a way that estimates cannot stand, and are not trusted.
+        """
         reset_options(options)
+        refused = [finding for finding in self.log.findings if finding.treatment is Treatment.REFUSED]
+        if refused:
+            more = f" (and {len(refused) - 1} more: coopenv doctor)" if len(refused) > 1 else ""
+            raise DataError(f"{self.where}: {refused[0]}; --trust '{refused[0].subject}' uses it unchanged{more}")
         assembler, samples, following = Assembler(self.binding), sorted(self.log.samples, key=_used), 0
         for k in range(self.scenario.horizon_ticks + 1):
             now = self._begin + round(k * NS / self._rate)
@@ -234,4 +233,4 @@ def open_bags(
         raise DataError(f"no such bag: {', '.join(missing)}")
     if topics is None:
         raise DataError(f"{where}: a ROS bag, which needs a map of its topics, --map topics.toml (see docs/bags.md)")
-    return Bag(paths, topics, overrides, selection.start or 0.0, selection.until, selection.robots)
+    return Bag(paths, topics, overrides, selection.start or 0.0, selection.until, selection.robots, selection.trust)

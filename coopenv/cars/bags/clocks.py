@@ -24,7 +24,7 @@ from coopenv.cars.backend.binding import Binding, marker_places
 from coopenv.cars.bags.topic_map import TRUTH, Chosen
 from coopenv.cars.messages.readings import Sample, sightings_of, tracks_of
 from coopenv.cars.settings.profile import Role
-from coopenv.estimation.poses import Array, about_z, bearing_misfit_deg
+from coopenv.estimation.poses import Array
 
 Times = NDArray[np.int64]
 
@@ -354,20 +354,6 @@ def azimuths_of(samples: Sequence[Sample], start: int, binding: Binding, vehicle
     time, target, ray = sightings_of(samples, start, marks)
     body = ray @ binding.scenario.cameras[vehicle].to_body().T
     return time, np.arctan2(body[:, 1], body[:, 0]), marker_places(landmarks)[target, :2]
-
-
-def misfit_of_truth(samples: Sequence[Sample], car: str, binding: Binding) -> float:
-    """Return by how much bearings of a car to landmarks differ from motion capture, deg (median); NaN: not known."""
-    start = samples[0].stamp if samples else 0
-    path = _path(tracks_of([s for s in samples if (s.car, s.role) == (car, Role.TRUTH)], start))
-    seen = [s for s in samples if s.car == car and s.role in CAMERAS]
-    times, azimuths, places = azimuths_of(seen, start, binding, binding.cars[car])
-    if path is None:
-        return math.nan
-    x, y, heading = path[2].over(times, times, level=True).T
-    flat = [np.column_stack([of, np.zeros(len(times))]) for of in (np.column_stack([x, y]), places)]
-    rays = np.column_stack([np.cos(azimuths), np.sin(azimuths), np.zeros(len(times))])
-    return bearing_misfit_deg(about_z(heading), flat[0], rays, flat[1])
 
 
 def moves_of(

@@ -30,7 +30,9 @@ from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TRUTH, Chosen, ClockSettings, MapFrame, TopicMap, select
 from coopenv.cars.bags.topics import NS, TopicRow, regularity
 from coopenv.cars.bags.transforms import StaticTree, odd_mountings, unread_truth
-from coopenv.cars.bags.turning import turn_contradiction
+from coopenv.cars.doctor.doctor import examine_map, examine_motion
+from coopenv.cars.doctor.finding import Finding, Treatment, with_error
+from coopenv.cars.doctor.streams import Streams
 from coopenv.cars.gate.wheel_command import read_drive
 from coopenv.cars.messages.codec import encode, stamp_of
 from coopenv.cars.messages.detectors import PLACED
@@ -217,7 +219,7 @@ class Track:
             stamps[np.flatnonzero(given)[k:]] += behind
         self.entries = [replace(e, stamp=int(s)) for e, s in zip(self.entries, stamps, strict=True)]
         wrong, self.delay = checked(stamps, received)
-        self.outlying = int(wrong.sum())
+        self.outlying += int(wrong.sum())
         self.entries = [entry for entry, off in zip(self.entries, wrong, strict=True) if not off]
 
     def behind(self, clocks: Clocks) -> float | None:
@@ -349,6 +351,9 @@ class BagLog:
     """Samples with unchanged times, by car and role."""
     cameras: Mapping[str, Stated] = field(default_factory=dict)
     """Contents of the CameraInfo of each car that publishes one, beside the calibration in `lenses`."""
+    findings: tuple[Finding, ...] = ()
+    """Streams that others contradict."""
+    streams: Streams | None = None  # the same, as arrays
 
 
 def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog:
@@ -392,9 +397,21 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         _check(entry, [track for track in tracks if track.chosen is entry], where)
     tolerance = given.clocks.tolerance * NS if mode == "auto" else float("inf")
     stated = {name: round(seconds * NS) for name, seconds in given.clocks.offsets.items()}
+    common = common_rate(tracks) if mode == "auto" else None
     delays = delays_of(tracks, len(files), given.clocks.tolerance * NS, stated)
     drifts = {track.chosen.topic: drift for track in tracks if (drift := track.remove_drift(tolerance))}
     clocks = reconcile(delays, tolerance, stated)
+    trusted = given.trust
+    streams = Streams(
+        _samples(tracks, clocks, {}),
+        binding,
+        {(entry.car, entry.role): entry.topic for entry in chosen},
+        lenses,
+        given.corrections,
+    )
+    moving = examine_motion(streams, trusted)
+    for track in tracks if moving.mends else ():
+        track.entries = moving.mended(track.entries)
     samples = _samples(tracks, clocks, {})
     leads = leads_of(samples, chosen, binding) if mode != "received" else {}
     fixed = {track.chosen.topic for track in tracks if track.source in stated}
@@ -412,7 +429,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         notes.append(f"turn rates of {listed(cars)} are the wheels'; unread: {listed(unread)}, of type {IMU}")
     frames = {s.car: s.stated.frame for s in samples if s.role is Role.DETECTIONS and s.stated.frame}
     mountings = odd_mountings(tree, frames, {car.name: car.names["body"] for car in given.cars}, cameras)
-    notes += [*_turn_notes(samples, chosen, binding), *elsewhere, *mountings]
+    notes += [*elsewhere, *mountings]
     rays = placed | {entry.car for entry in chosen if entry.role is Role.BEARINGS and not given.distorted}
     pixels = {name: lens for name, lens in lenses.items() if name not in rays}
     added: dict[tuple[str, Role], tuple[str, float]] = {}
@@ -425,8 +442,43 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         moved = (moves.get(topic, 0) + (shift.added if shift else 0)) / NS + given.clocks.leads.get(topic, 0.0)
         added.setdefault((track.chosen.car, track.chosen.role), (topic, moved))
     rows = rows_of(files, chosen, samples, clocks, tracks, leads)
+    streams = replace(streams, samples=samples, lenses=pixels, added=added)
+    findings = [*([common] if common else []), *moving.findings, *examine_map(streams, moving.findings, trusted)]
     stating = {car: about for car, (_, about) in published.items()}
-    return BagLog(samples, rows, tuple(notes), pixels, added, unknown, sent, cameras=stating)
+    return BagLog(samples, rows, tuple(notes), pixels, added, unknown, sent, stating, tuple(findings), streams)
+
+
+NO_CRYSTAL = 500e-6
+"""s per s, drift above which a clock is none with a quartz crystal, whose errors are below 100e-6 from -40 to 85 C."""
+
+
+REFINED = 3  # times that the rate is estimated: windows of a steep delay have a small error
+
+
+def common_rate(tracks: Sequence[Track]) -> Finding | None:
+    """Return the finding that all clocks run at another rate than the recorder's; times of reception get theirs.
+
+    If all sources drift alike, their stamps are the time: of a simulation, or beside a recorder whose clock is wrong.
+    """
+    known = [track for track in tracks if track.delay is not None and len(track.entries) >= 100]
+    drifts = np.array([track.delay.drift for track in known if track.delay is not None])
+    if len(drifts) < 2 or abs(np.median(drifts)) < NO_CRYSTAL:
+        return None
+    spread = np.abs(drifts - np.median(drifts))
+    if (spread > max(NO_CRYSTAL, 0.05 * abs(np.median(drifts)))).mean() > 0.2:
+        return None
+    begin, rate = min(track.entries[0].received for track in known), 1.0
+    for _ in range(REFINED):
+        step = 1.0 - float(np.median([track.delay.drift for track in known if track.delay is not None]))
+        rate *= step
+        for track in tracks:
+            track.entries = [replace(e, received=begin + round(step * (e.received - begin))) for e in track.entries]
+            track.clean_stamps("stamps")
+    error = float(np.std(drifts) / np.sqrt(len(drifts)))
+    size = with_error(1e6 * (1.0 - rate), max(1.0, 1e6 * error))
+    text = f"all {len(drifts)} topics drift alike, by {size} us per s: time runs {rate:.4g} times as fast in"
+    text += " stamps as where they were received, as in a simulation; stamps count"
+    return Finding("clocks", text, 1.0 - rate, error, treatment=Treatment.MENDED)
 
 
 def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:
@@ -478,15 +530,6 @@ def _notes(tracks: Sequence[Track], clocks: Clocks, given: TopicMap, drifts: Map
     for track in tracks if given.clocks.mode != "received" else ():
         if not all(entry.stamp for entry in track.entries):
             yield f"topic {track.chosen.topic}: messages without stamps count when they were received"
-
-
-def _turn_notes(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Binding) -> Iterator[str]:
-    """Yield notes on turn rates that never change although the car turns."""
-    for car in binding.cars:
-        topics = {entry.role: entry.topic for entry in chosen if entry.car == car}
-        if why := turn_contradiction([sample for sample in samples if sample.car == car], binding, car):
-            topic = next(topics[role] for role in (Role.IMU, Role.ODOMETRY, Role.WHEEL) if role in topics)
-            yield f"topic {topic}: the turn rate of {car} {why}"
 
 
 def _lead_notes(

@@ -172,6 +172,8 @@ class TopicMap(Section):
     """Source of bearings; `auto`: detections if the bag has them, or else bearings."""
     distorted: bool = True
     """Treat `bearings` as computed from distorted pixels, as the authors' are."""
+    trust: tuple[str, ...] = Field(default=(), max_length=64)
+    """Topics, or other subjects of findings, that are used unchanged although other streams contradict; `all`: each."""
     start: float = Field(default=0.0, ge=0.0, le=1e6)
     """Time left out after all needed topics have begun, s."""
     duration: Positive | None = None

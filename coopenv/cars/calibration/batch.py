@@ -408,7 +408,7 @@ class Batch:
                 at, yaw = (np.interp(time, car.truth_time, v) for v in (car.truth, np.unwrap(car.truth_yaw)))
                 flat = np.exp(-1j * yaw) * (point[:, 0] + 1j * point[:, 1] - at)
                 to = np.stack([flat.real, flat.imag, point[:, 2] - car.height], axis=-1) - car.lever
-                found.append(_misfit(unit, to))
+                found.append(misfit(unit, to))
             total += min(found)
         return total
 
@@ -426,7 +426,7 @@ class Batch:
             turn = Rotation.from_euler("z", turned[:, None])
             lever = turn.apply(car.lever) + np.stack([moved.real, moved.imag, 0.0 * turned], axis=-1)
             point = self.places[target[inside]] - [0.0, 0.0, car.height]
-            good.append((middle, *_seen_from(turn.apply(car.ray[inside] @ car.mounting.T), lever, point)))
+            good.append((middle, *seen_from(turn.apply(car.ray[inside] @ car.mounting.T), lever, point)))
         if not good:
             raise DataError(
                 f"{car.name}: two static landmarks are never seen within {WINDOW:g} s; no pose can be found"
@@ -438,7 +438,7 @@ class Batch:
         return np.stack([now.real, now.imag, np.unwrap(yaw)], axis=-1), float(misfit.mean())
 
 
-def _seen_from(unit: Array, lever: Array, point: Array) -> tuple[float, float, complex]:
+def seen_from(unit: Array, lever: Array, point: Array) -> tuple[float, float, complex]:
     """Return misfit, heading and place of a body by rays (n, 3) from its `lever` (n, 3), m, to points (n, 3), m.
 
     With a heading given, the place is linear in the sightings: all headings are tried, then finer ones.
@@ -452,7 +452,7 @@ def _seen_from(unit: Array, lever: Array, point: Array) -> tuple[float, float, c
             shift = np.linalg.lstsq((across[:, :, :2] / far).reshape(-1, 2), (b / far).ravel())[0]
             ahead = to - [*shift, 0.0]
             far = np.maximum(np.linalg.norm(ahead, axis=-1), 0.1)[:, None, None]
-        return _misfit(unit, ahead), heading, np.exp(1j * heading) * complex(*shift)
+        return misfit(unit, ahead), heading, np.exp(1j * heading) * complex(*shift)
 
     tried: NDArray[Any] = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
     for step in (0.02, 0.004):
@@ -486,7 +486,8 @@ def _flat(parts: tuple[Array, Array, Array]) -> Array:
     return np.concatenate([part.ravel() for part in parts])
 
 
-def _misfit(unit: Array, to: Array) -> float:
+def misfit(unit: Array, to: Array) -> float:
+    """Return the mean of (2 sin(angle / 2))^2, up to 0.04, between unit vectors and vectors (n, 3)."""
     cosine = (to * unit).sum(axis=-1) / np.maximum(np.linalg.norm(to, axis=-1), 1e-9)
     return float(np.minimum(2.0 - 2.0 * cosine, 0.04).mean())
 

@@ -134,11 +134,24 @@ def calibrate(drive: CalibrationDrive, truth: bool = True) -> Calibrated:
 
 def _calibrated(batch: Batch) -> Calibrated:
     pairs = exchanged(batch)
-    given = fit = batch.fit(batch.begin())
+    given = batch.fit(batch.begin())
+    return _result(batch, given, corrected(batch, given), pairs)
+
+
+def corrected(batch: Batch, given: Fit, tried_most: int = TRIED, least: float = -np.inf) -> Fit:
+    """Return the fit with the wrong constants corrected, from one with all as given.
+
+    Args:
+        batch: the least squares.
+        given: fit with all constants as given.
+        tried_most: hypotheses that are fitted in each round.
+        least: linearised gain at which one is fitted.
+    """
+    fit, groups = given, hypotheses(batch)
     penalty = 0.5 * log(sum(len(batch.times(c)) for c in range(len(batch.cars))))
-    groups = hypotheses(batch)
     for _ in range(MOST):
-        ranked = sorted(gains(batch, fit, groups, penalty), key=lambda entry: -entry[0])[:TRIED]
+        ranked = sorted(gains(batch, fit, groups, penalty), key=lambda entry: -entry[0])[:tried_most]
+        ranked = [entry for entry in ranked if entry[0] >= least]
         tried = [batch.fit(replace(fit, free=fit.free | np.isin(np.arange(len(fit.x)), group))) for _, group in ranked]
         if not tried:
             break
@@ -153,8 +166,7 @@ def _calibrated(batch: Batch) -> Calibrated:
     for title, part in parts_of(batch).items():  # coefficients of a lens are right or wrong together
         if title.endswith(INTRINSICS):
             kept[part] = kept[part].any()
-    fit = batch.fit(replace(fit, free=kept, x=np.where(kept, fit.x, 0.0)))
-    return _result(batch, given, fit, pairs)
+    return batch.fit(replace(fit, free=kept, x=np.where(kept, fit.x, 0.0)))
 
 
 def gains(
@@ -183,10 +195,17 @@ def errors(batch: Batch, fit: Fit) -> Array:
     return error
 
 
-def wrong(batch: Batch, fit: Fit, error: Array) -> tuple[Mask, Mask]:
-    """Return which constants are wrong, and which are off, yet within the noise by which the environment draws them."""
-    finest = np.array([FINEST[kind.unit] for kind in batch.kinds])
-    off, drawn = fit.free & (np.abs(fit.x) > np.maximum(SIGNIFICANT * error, finest)), np.zeros(len(finest))
+def wrong(batch: Batch, fit: Fit, error: Array, coarse: float = 1.0) -> tuple[Mask, Mask]:
+    """Return which constants are wrong, and which are off, yet within the noise by which the environment draws them.
+
+    Args:
+        batch: the least squares.
+        fit: with the constants that may be wrong as free ones.
+        error: (G,) standard errors.
+        coarse: times the deviations and standard errors that count as wrong.
+    """
+    finest = coarse * np.array([FINEST[kind.unit] for kind in batch.kinds])
+    off, drawn = fit.free & (np.abs(fit.x) > np.maximum(coarse * SIGNIFICANT * error, finest)), np.zeros(len(finest))
     for c, car in enumerate(batch.cars):
         noise = batch.drive.scenario.noises[car.vehicle]
         drawn[batch.own(c).start + np.array([SCALE, BIAS])] = noise.odometry_scale, float(np.max(noise.gyro_bias))
@@ -196,10 +215,10 @@ def wrong(batch: Batch, fit: Fit, error: Array) -> tuple[Mask, Mask]:
 
 def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]) -> Calibrated:
     """Return the wrong constants with the others as given, and the others estimated all together."""
-    unexplained = list(_unexplained(batch, fit))
-    fit = given if unexplained else fit
+    reasons = list(unexplained(batch, fit))
+    fit = given if reasons else fit
     error, wide = errors(batch, fit), batch.prior
-    bad, within = (found & (not unexplained) for found in wrong(batch, fit, error))
+    bad, within = (found & (not reasons) for found in wrong(batch, fit, error))
     tight = [next((std for begin, std in TIGHT.items() if kind.name.startswith(begin)), np.inf) for kind in batch.kinds]
     batch.prior = np.where(fit.free, wide, np.minimum(tight, wide))
     whole = batch.fit(replace(fit, free=batch.known))
@@ -214,7 +233,7 @@ def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]
         old, value, std = (factor * float(v) for v in (batch.base[n], batch.base[n] + x[n], error[n]))
         rows[int(n)] = ConstantRow(kind.name, kind.unit, old, value, std, finding)
     names = batch.drive.landmarks
-    lines = [*unexplained, *(f"markers {names[i]} and {names[j]} are exchanged" for i, j in pairs)]
+    lines = [*reasons, *(f"markers {names[i]} and {names[j]} are exchanged" for i, j in pairs)]
     for title, part in parts_of(batch).items():
         found = [rows[n] for n in part if bad[n]]
         changes = [f"{r.name.split('.', 1)[1]} {r.given:.5g} -> {r.value:.5g} +- {r.error:.2g} {r.unit}" for r in found]
@@ -225,11 +244,11 @@ def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]
         late = batch.own(c).start + np.array([CAMERA_TIME, TRUTH_TIME])
         if bad[late].all() and abs(np.diff(x[late])[0]) < SIGNIFICANT * np.hypot(*error[late]):
             lines.append(f"{car.name}: camera and motion capture agree, so that the stamps of wheels and IMU are wrong")
-    noise = {} if unexplained else _noise(batch, fit)
-    return Calibrated(batch, given, fit, tuple(rows.values()), tuple(lines), notes, noise, not unexplained)
+    noise = {} if reasons else _noise(batch, fit)
+    return Calibrated(batch, given, fit, tuple(rows.values()), tuple(lines), notes, noise, not reasons)
 
 
-def _unexplained(batch: Batch, fit: Fit) -> Iterator[str]:
+def unexplained(batch: Batch, fit: Fit) -> Iterator[str]:
     """Yield a line per car whose residuals no constant explains."""
     for car, (seen, place, _), truth in zip(batch.cars, fit.sigma, batch.truth, strict=True):
         unit, most = ("rad", LARGEST_ANGLE) if car.lens is None else ("px", LARGEST_PIXEL)

@@ -1,6 +1,6 @@
 """Input of a calibration from a drive: image points, odometry and motion capture of each car, from bags and logs."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from coopenv.base.errors import DataError
-from coopenv.cars.backend.binding import marker_places
-from coopenv.cars.messages.readings import sightings_of, tracks_of, yaw_of
+from coopenv.cars.doctor.streams import CarStreams, Streams
+from coopenv.cars.messages.readings import yaw_of
 from coopenv.cars.messages.vision import Calibration, rays
 from coopenv.cars.settings.profile import Role
 from coopenv.cars.settings.sensors import Correction
@@ -19,7 +19,6 @@ from coopenv.estimation.poses import Array, log_so3
 from coopenv.scenario import Scenario
 
 if TYPE_CHECKING:
-    from coopenv.cars.bags.bag import Bag
     from coopenv.observers.recording import Recording
 
 NS = 1e-9
@@ -115,25 +114,23 @@ def car_of(
     return car
 
 
-def drive_of_bag(bag: "Bag") -> CalibrationDrive:
-    """Return the drive of bags. Raises DataError: a car has too few sightings."""
-    scenario, binding, led = bag.scenario, bag.binding, bag.binding.leaders.values()
-    static = [i for i, m in enumerate(scenario.landmarks) if m.motion.kind == "static" and i not in led]
-    number = {marker: static.index(target) for marker, target in binding.targets.items() if target in static}
-    cars = tuple(_of_samples(bag, name, vehicle, number) for name, vehicle in binding.cars.items())
-    names = tuple(scenario.landmarks[i].name for i in static)
-    return CalibrationDrive(cars, names, marker_places(scenario.landmarks)[static], scenario)
+def drive_of_streams(streams: Streams, where: str, names: Iterable[str] | None = None) -> CalibrationDrive:
+    """Return the drive of some cars, None: of all. Raises DataError, which begins with `where`: too few sightings."""
+    chosen = streams.binding.cars if names is None else names
+    cars = tuple(_of_car(streams, streams.car(name), where) for name in chosen)
+    scenario = streams.binding.scenario
+    marks = tuple(scenario.landmarks[i].name for i in streams.standing)
+    return CalibrationDrive(cars, marks, streams.places, scenario)
 
 
-def _of_samples(bag: "Bag", name: str, vehicle: int, number: dict[int, int]) -> CarDrive:
-    samples, added = [s for s in bag.log.samples if s.car == name], bag.log.added
-    time, target, ray = sightings_of(samples, samples[0].stamp, number)
+def _of_car(streams: Streams, car: CarStreams, where: str) -> CarDrive:
+    added, name = streams.added, car.name
     topics = [next((added[name, role] for role in roles if (name, role) in added), ("", 0.0)) for roles in ROLES]
-    right = bag.map.corrections.get(name, Correction())
-    tracks = {key: value for key, value in tracks_of(samples, samples[0].stamp).items() if "command" not in key}
-    found = {"time": time, "target": target, "topics": tuple(topics[:3]), "gyro_added": topics[3][1], **tracks}
+    right = streams.corrections.get(name, Correction())
+    tracks = {key: value for key, value in car.tracks.items() if "command" not in key}
+    found = {"time": car.time, "target": car.target, "topics": tuple(topics[:3]), "gyro_added": topics[3][1], **tracks}
     found["corrected"] = (right.wheel_scale, right.gyro_bias)
-    return car_of(bag.scenario, name, vehicle, bag.log.lenses.get(name), ray, bag.where, **found)
+    return car_of(streams.binding.scenario, name, car.vehicle, car.lens, car.ray, where, **found)
 
 
 def drive_of_recording(recording: "Recording", path: Path) -> CalibrationDrive:

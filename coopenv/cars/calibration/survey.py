@@ -23,7 +23,7 @@ from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topics import cars_of, examined, markers_of
 from coopenv.cars.calibration.batch import BIAS, CAMERA_TIME, LATE, NUISANCE, ROT, Batch, Fit
 from coopenv.cars.calibration.calibrate import errors
-from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive, drive_of_bag
+from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive, drive_of_streams
 from coopenv.cars.settings.profile import Role
 from coopenv.cars.settings.toml import toml_text
 from coopenv.estimation.poses import Array
@@ -241,7 +241,8 @@ def survey(bags: Sequence[Path], like: str, folder: Path, truth: bool = True) ->
     with TemporaryDirectory() as scratch:  # an environment in which every marker has some place, to read the bags
         begun = replace(room, folder=Path(scratch))
         begun.write(apart, dict.fromkeys(unnamed, (0.0, 0.0, 0.0)), unnamed, {})
-        drive = drive_of_bag(open_bags(bags, {}, begun.files[1]))
+        bag = open_bags(bags, {}, begun.files[1])
+        drive = drive_of_streams(bag.streams, bag.where)
     own, standing, notes = sorted_markers(drive, truth, numbers)
     _check_some(title, standing, notes)
     batch, fit, places, starts = solved(only(drive, [numbers.index(n) for n in standing]), truth)

@@ -1,4 +1,4 @@
-"""`coopenv import`, `coopenv calibrate` and `coopenv identify`: bags of cars."""
+"""`coopenv import`, `coopenv doctor`, `coopenv calibrate` and `coopenv identify`: bags of cars."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ def import_(
     out: Annotated[Path | None, typer.Option(help="MCAP file to write, a recording of coopenv.")] = None,
     seed: options.Seed = 0,
     overrides: options.Overrides = None,
+    trust: options.Trust = None,
     observer: options.LogObserver = None,
     scene: options.LogScene = True,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
@@ -68,11 +69,12 @@ def import_(
         return
     from coopenv.base.files import check_new
     from coopenv.cars.bags.bag import open_bags
+    from coopenv.sources.selection import Selection
 
     if out is not None:
         check_log(out, observer, scene)
         check_new(out, force)
-    bag = open_bags(bags, options.parse_overrides(overrides), topics)
+    bag = open_bags(bags, options.parse_overrides(overrides), topics, Selection(trust=tuple(trust or ())))
     _print_topics(bag.log.rows, as_json)
     ticks = bag.capabilities.ticks or 0
     seconds = (ticks - 1) / bag.scenario.rates.camera
@@ -120,6 +122,44 @@ def _print_topics(rows: Sequence[TopicRow], as_json: bool) -> None:
     options.console().print(table)
 
 
+def doctor(
+    bags: Annotated[list[Path], in_bags(help="Bags of one drive, such as one per car.")],
+    topics: Annotated[Path, typer.Option("--map", help="TOML file with the map of the bags' topics (docs/bags.md).")],
+    overrides: options.Overrides = None,
+    trust: options.Trust = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """Compare every stream of ROS bags with every other, and print which one the others contradict.
+
+    The exit status is 1 if a finding refuses the drive.
+    """
+    import warnings
+
+    from coopenv.base.errors import DataWarning
+    from coopenv.cars.bags.bag import open_bags
+    from coopenv.cars.doctor.finding import Treatment
+    from coopenv.report.table import Table
+    from coopenv.sources.selection import Selection
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)  # the findings follow
+        bag = open_bags(bags, options.parse_overrides(overrides), topics, Selection(trust=tuple(trust or ())))
+    findings, console = bag.log.findings, options.console()
+    if as_json:
+        options.print_json({"findings": [*findings], "notes": [*bag.log.notes]})
+    else:
+        table = Table.of_texts(["stream", "contradiction", "mended by", "treatment"], [])
+        for finding in findings:
+            table.add(finding.subject, finding.text, finding.key, finding.treatment.value)
+        console.print(table if findings else "No stream contradicts another.", soft_wrap=not findings)
+        for note in bag.log.notes:
+            console.print(note, soft_wrap=True)
+        read = [row for row in bag.log.rows if row.role]
+        console.print(f"{bag.where}: {len(bag.binding.cars)} cars, {len(read)} topics", soft_wrap=True)
+    if any(finding.treatment is Treatment.REFUSED for finding in findings):
+        raise typer.Exit(1)
+
+
 def calibrate(
     bags: Annotated[list[Path], in_bags(metavar="BAG...|FILE.mcap", help="Bags of one drive, or a log of coopenv.")],
     topics: options.TopicMap = None,
@@ -146,7 +186,7 @@ def calibrate(
     from coopenv.cars.bags.bag import open_bags
     from coopenv.cars.calibration.calibrate import calibrate as calibrated
     from coopenv.cars.calibration.calibrate import toml_text
-    from coopenv.cars.calibration.drives import drive_of_bag, drive_of_recording
+    from coopenv.cars.calibration.drives import drive_of_recording, drive_of_streams
     from coopenv.cars.calibration.figure import residual_figure
     from coopenv.runs.console import Progress
     from coopenv.sources.registry import kind_of
@@ -156,7 +196,8 @@ def calibrate(
     with new_folder(out):
         check_file(out / "calibration.toml")
         if topics is not None:
-            drive = drive_of_bag(open_bags(bags, options.parse_overrides(overrides), topics))
+            bag = open_bags(bags, options.parse_overrides(overrides), topics)
+            drive = drive_of_streams(bag.streams, bag.where)
         elif overrides:
             raise CoopenvError("--override: needs the map of the bags' topics, --map topics.toml")
         elif len(bags) > 1 or not kind_of(bags[0]).reader:

@@ -235,10 +235,14 @@ def health(
             )
         if seconds := (5.0 if off_board else 0.0) if clocks is None else clocks:
             with needing(f"clocks need an extra, or --clocks 0: {install_command('svea')}"):
-                from coopenv.cars.backend.assembler import measured_clocks
+                from coopenv.cars.backend.assembler import arrivals_of, measured_clocks
+                from coopenv.cars.backend.backend import examined_arrivals
 
-            for name, clock in measured_clocks(transport, fleet, car, seconds).items():
+            arrivals = arrivals_of(transport, fleet, car, seconds)
+            for name, clock in measured_clocks(arrivals, fleet, car).items():
                 print(f"{car}: clock of {name}: {clock}")
+            for finding in examined_arrivals(arrivals, fleet) if fleet.environment else ():
+                print(f"{car}: {finding}")
         if read_only:
             return
         if fleet.network.kind != "zenoh":

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,9 +27,11 @@ class Detections:
 
     markers: tuple[int, ...]  # m numbers of markers (colour signatures)
     bearings: Array  # (m, 3) unit vectors camera -> target, optical frame, without the lens's distortion
-    dropped: int = 0  # blocks that were left out: second ones of a marker, beyond the image, not finite
+    dropped: int = 0  # blocks that were left out: second ones of a marker, beyond the image, not finite, of low quality
     late: int = 0  # ns from the stamp to the exposure's middle
     qualities: tuple[Quality, ...] = ()  # (m,) as the detector states them; empty: made without a detector
+    poor: int = 0  # of those left out, of low quality
+    outside: int = 0  # likewise, beyond the image or without a ray
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +40,7 @@ class Twist:
 
     linear: Array | None  # (3,) m/s
     angular: Array | None  # (3,) rad/s
+    pose: "CarPose | None" = None  # of the same message, in a frame of its own
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,14 +137,16 @@ def tags(
     if len(found) > MOST:
         raise CoopenvError(f"{len(found)} detections, a camera has at most {MOST}")
     for tag in found:
-        counts = tag.ray is not None and (known is None or tag.number in known)
+        counts = tag.ray is not None and not tag.quality.is_poor(vision) and (known is None or tag.number in known)
         if counts and (tag.number not in best or tag.size > best[tag.number].size):
             best[tag.number] = tag
     units = np.array([best[number].ray for number in sorted(best)], dtype=np.float64).reshape(-1, 3)
     rows = [tag.row for tag in found if tag.row is not None]
     late = vision.late(rows, camera.image_size[1]) if camera else 0
     numbers = sorted(best)
-    return Detections(tuple(numbers), units, len(found) - len(best), late, tuple(best[n].quality for n in numbers))
+    qualities = tuple(best[n].quality for n in numbers)
+    poor, outside = sum(tag.quality.is_poor(vision) for tag in found), sum(tag.ray is None for tag in found)
+    return Detections(tuple(numbers), units, len(found) - len(best), late, qualities, poor, outside)
 
 
 LONGEST_MODE = 64  # characters
@@ -264,6 +270,14 @@ def _twist(twist: Any) -> Twist:
     return Twist(linear, angular)
 
 
+def _moving_pose(message: Any) -> Twist:
+    """Return the velocities of an Odometry with its pose, if that is one."""
+    pose = None
+    with suppress(CoopenvError):
+        pose = placed(message.pose.pose)
+    return replace(_twist(message.twist), pose=pose)
+
+
 def _velocities(twist: Any) -> Twist:
     """Return velocities, in which what is not finite is not measured: a turn rate is unknown, the others are 0."""
     linear, angular = ([part.x, part.y, part.z] for part in (twist.linear, twist.angular))
@@ -324,7 +338,7 @@ POSES: dict[str, Callable[[Any], Value]] = {
 TWISTS: dict[str, Callable[[Any], Value]] = {
     "geometry_msgs/msg/TwistWithCovarianceStamped": lambda message: _twist(message.twist),
     "geometry_msgs/msg/TwistStamped": lambda message: _velocities(message.twist),
-    "nav_msgs/msg/Odometry": lambda message: _twist(message.twist),  # in the child frame
+    "nav_msgs/msg/Odometry": _moving_pose,  # in the child frame
     "geometry_msgs/msg/Twist": _velocities,
     "geometry_msgs/msg/TwistWithCovariance": _twist,
 }

@@ -14,6 +14,7 @@ from scipy.ndimage import map_coordinates
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.base.files import muted_errors
 from coopenv.base.installation import install_command, needing
+from coopenv.cars.settings.profile import VisionSettings
 from coopenv.estimation.lens import distort, undistort
 from coopenv.estimation.poses import Array
 
@@ -72,6 +73,11 @@ class Quality(NamedTuple):
     margin: float = math.nan  # decision margin of AprilTag: contrast of black and white
     score: float = math.nan  # 0 to 1
     hamming: float = math.nan  # bits of the code that were corrected
+
+    def is_poor(self, least: VisionSettings) -> bool:
+        """Return whether a stated quality is too low; a margin or score of 0 is not stated."""
+        low = 0.0 < self.margin < least.least_margin or 0.0 < self.score < least.least_score
+        return low or self.hamming > least.most_hamming
 
 
 class Tag(NamedTuple):

@@ -141,6 +141,12 @@ class VisionSettings(Section):
     the first row."""
     rectified: bool = False
     """Treat pixels as rectified (`image_rect`): the matrix P of CameraInfo applies, without distortion."""
+    most_hamming: int = Field(default=1, ge=0, le=10)
+    """Corrected bits of a detected tag, above which it is left out."""
+    least_margin: float = Field(default=10.0, ge=0.0, le=1e3)
+    """Decision margin of a detected tag, below which it is left out; 0 in a message means not stated."""
+    least_score: float = Field(default=0.2, ge=0.0, le=1.0)
+    """Score of a detected box, below which it is left out; 0 in a message means not stated."""
 
     def late(self, rows: Sequence[float], height: int) -> int:
         """Return the time, ns, from a stamp to the middle of the exposure of rows; none: of the middle row."""

@@ -37,6 +37,10 @@ class Correction(Section):
     """Relative error of its speeds, removed."""
     gyro_bias: Number = 0.0
     """Error of its turn rates, removed, rad/s."""
+    wheel_factor: Number = 1.0
+    """Factor of its speeds before that, for another unit or sign."""
+    gyro_factor: Number = 1.0
+    """Factor of its turn rates before that, for another unit or sign."""
 
     @field_validator("distortion")
     @classmethod
@@ -53,8 +57,9 @@ class Correction(Section):
     def twist(self, twist: "Twist", role: Role, by_imu: bool) -> "Twist":
         """Return a measured twist without its errors; `by_imu`: turn rates are the IMU's, not the wheels'."""
         v, w = twist.linear, None if by_imu and role is Role.WHEEL else twist.angular
-        linear = None if v is None else v / (1.0 + self.wheel_scale)
-        return replace(twist, linear=linear, angular=None if w is None else w - (0.0, 0.0, self.gyro_bias))
+        linear = None if v is None else v * (self.wheel_factor / (1.0 + self.wheel_scale))
+        angular = None if w is None else self.gyro_factor * w - (0.0, 0.0, self.gyro_bias)
+        return replace(twist, linear=linear, angular=angular)
 
 
 Lead = Annotated[float, Field(ge=-2.0, le=2.0)]
@@ -77,6 +82,8 @@ class Sensors(Section):
     """Constants by the name of a car, see `calibration`."""
     leads: dict[TopicName, Lead] = Field(default={})
     """Time added to the stamps of a topic in every drive, s."""
+    trust: tuple[str, ...] = Field(default=(), max_length=64)
+    """Topics, or other subjects of findings, with which cars arm although other streams contradict; `all`: each."""
 
     @property
     def roles(self) -> tuple[Role, ...]:

@@ -388,3 +388,34 @@ def test_a_gyro_that_sends_zeros_stops_the_cars_and_keeps_them_from_arming(
         assert re.search(r"svea\d: its turn rate is 0 rad/s in all \d+ messages, while .* turns? it by ", stopped)
         with pytest.raises(CoopenvError, match=r"not armed: svea\d: its turn rate is 0 rad/s"):
             env.reset(options={"arm": True})
+
+
+@pytest.mark.parametrize(
+    ("role", "line"),
+    [
+        (Role.IMU, r"turn rate of svea\d is -[01]\.\d+\(\d+\) times that of motion capture \(the other sign\)"),
+        (Role.WHEEL, r"velocity of svea\d is -[01]\.\d+\(\d+\) times that of motion capture \(the other sign\)"),
+    ],
+)
+def test_cars_whose_sensors_contradict_motion_capture_do_not_arm_again(
+    role: Role, line: str, lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first episode moves them; the line is that of a bag, see `tests/cars/doctor`."""
+    _, hub, _ = lab
+    reading = assembler.read
+
+    def reversed_by(read_as: Role, *args: Any, **options: Any) -> Any:
+        value = reading(read_as, *args, **options)
+        if read_as is not role:
+            return value
+        parts = (None if part is None else -part for part in (value.linear, value.angular))
+        return Twist(*parts)
+
+    monkeypatch.setattr(assembler, "read", reversed_by)
+    blind = BLIND + "max_std = 1e6\nmax_nis = 1e6\n"
+    with closing(env_of(cars(write_fleet(tmp_path, OVERTAKING, SAFETY + blind), hub))) as env:
+        env.reset(seed=3, options={"arm": True})
+        for turn in (1.0, -1.0, 1.0):
+            drive(env, 40, np.array([0.6, turn], np.float32))
+        with pytest.raises(CoopenvError, match=f"not armed: .*{line}"):
+            env.reset(options={"arm": True})

@@ -147,3 +147,51 @@ def test_rectified_frames_have_the_projection_of_camera_info() -> None:
     )
     assert calibration_of(info) == Calibration((640, 480), (450.0, 455.0), (322.0, 236.0), (-0.3, 0.1, 0.0, 0.0, 0.0))
     assert calibration_of(info, rectified=True) == Calibration((640, 480), (400.0, 410.0), (310.0, 230.0), (0.0,) * 5)
+
+
+@pytest.mark.parametrize(
+    ("fields", "size", "focal", "centre"),
+    [
+        ({}, (640, 480), (450.0, 455.0), (322.0, 236.0)),
+        ({"binning_x": 1, "binning_y": 1}, (640, 480), (450.0, 455.0), (322.0, 236.0)),
+        ({"binning_x": 2, "binning_y": 4}, (320, 120), (225.0, 113.75), (161.0, 59.0)),
+        (
+            {"roi": {"x_offset": 100, "y_offset": 50, "width": 320, "height": 200}},
+            (320, 200),
+            (450.0, 455.0),
+            (222.0, 186.0),
+        ),
+        (
+            {"binning_x": 2, "binning_y": 2, "roi": {"x_offset": 100, "y_offset": 50, "width": 320, "height": 200}},
+            (160, 100),
+            (225.0, 227.5),
+            (111.0, 93.0),
+        ),
+    ],
+)
+def test_a_calibration_of_the_whole_sensor_becomes_that_of_its_images(
+    fields: dict[str, Any], size: tuple[int, int], focal: tuple[float, float], centre: tuple[float, float]
+) -> None:
+    k = [450.0, 0.0, 322.0, 0.0, 455.0, 236.0, 0.0, 0.0, 1.0]
+    info = make("sensor_msgs/msg/CameraInfo", width=640, height=480, k=k, d=[0.0] * 5, **fields)
+    assert calibration_of(info) == Calibration(size, focal, centre, (0.0,) * 5)
+
+
+POOR: dict[str, list[dict[str, Any]]] = {
+    "apriltag_msgs/msg/AprilTagDetectionArray": [
+        {"id": 3, "centre": (100.0, 50.0), "corners": SQUARE, "hamming": bits, "decision_margin": margin}
+        for bits, margin in ((2, 80.0), (0, 5.0))
+    ],
+    "vision_msgs/msg/Detection2DArray": [
+        {"results": [{"hypothesis": {"class_id": "3", "score": 0.1}}], "bbox": {"center": {"position": PIXELS[3]}}}
+    ],
+}
+
+
+@pytest.mark.parametrize("kind", POOR)
+def test_detections_of_low_quality_are_left_out_and_counted(kind: str) -> None:
+    message = make(kind, detections=[*LIVE[kind]["detections"][:1], *POOR[kind]])
+    found = read(Role.DETECTIONS, message, CAMERA)
+    assert found.markers == (7,) and found.poor == len(POOR[kind])  # type: ignore[union-attr]
+    loose = VisionSettings(most_hamming=10, least_margin=0.0, least_score=0.0)
+    assert read(Role.DETECTIONS, message, CAMERA, vision=loose).markers == (3, 7)  # type: ignore[union-attr]

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coopenv.cars.bags.turning import constant_turn_rate
+from coopenv.cars.doctor.turning import constant_turn_rate
 from coopenv.estimation.poses import Array
 
 WHEELBASE = 0.324

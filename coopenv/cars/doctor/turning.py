@@ -1,7 +1,6 @@
 """Turn rates that never change while something else shows that the car turns: a dead gyro, wheels that measure none."""
 
 import math
-from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -10,43 +9,13 @@ from scipy.ndimage import median_filter
 
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.bags.clocks import CAMERAS, azimuths_of
-from coopenv.cars.messages.readings import Sample, Twist, tracks_of
+from coopenv.cars.messages.readings import Sample, tracks_of
 from coopenv.estimation.poses import Array
 
 TURNED = math.radians(10.0)  # of a car, by anything else than its turn rate
 WINDOW, NOISE, SIGNIFICANT = 0.4, math.radians(2.0), 3.0
 """s over which bearings are compared, rad by which they change for another reason than a turn, and standard errors."""
 TRIM = 0.1  # rad of steering with which a car may drive straight on
-
-
-KEPT = 3_000  # samples of a car, some 10 s
-
-
-class TurnMonitor:
-    """Samples of the cars whose turn rate has not changed yet, and what contradicts such a rate."""
-
-    def __init__(self, binding: Binding) -> None:
-        """Begin without samples."""
-        self._binding = binding
-        self._kept = {car: deque[Sample](maxlen=KEPT) for car in binding.cars}
-        self._rates: dict[str, float] = {}
-        self._changed: set[str] = set()
-
-    def put(self, sample: Sample) -> None:
-        """Take a sample, with the turn rate that is used, or a command."""
-        if sample.car in self._changed or sample.car not in self._kept:
-            return
-        if isinstance(sample.value, Twist) and sample.value.angular is not None:
-            rate = float(sample.value.angular[2])
-            if self._rates.setdefault(sample.car, rate) != rate:
-                self._changed.add(sample.car)
-                self._kept[sample.car].clear()
-                return
-        self._kept[sample.car].append(sample)
-
-    def contradiction(self, car: str) -> str | None:
-        """Return what contradicts a car's turn rate, see `turn_contradiction`."""
-        return turn_contradiction([*self._kept[car]], self._binding, car)
 
 
 def turn_contradiction(samples: Sequence[Sample], binding: Binding, car: str) -> str | None:

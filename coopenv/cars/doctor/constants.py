@@ -1,0 +1,118 @@
+"""Checks of constants by the least squares of `coopenv calibrate`, of which a score test finds those worth a fit."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from coopenv.base.errors import DataError
+from coopenv.cars.calibration.batch import Batch, Fit
+from coopenv.cars.calibration.calibrate import (
+    corrected,
+    errors,
+    exchanged,
+    parts_of,
+    unexplained,
+    wrong,
+)
+from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive, drive_of_streams
+from coopenv.cars.doctor.finding import Finding, Treatment
+from coopenv.cars.doctor.motion import SPEED_FACTORS
+from coopenv.cars.doctor.sight import BAD, REMOVED
+from coopenv.cars.doctor.streams import Streams
+from coopenv.cars.messages.vision import rays
+
+TRIED = 2  # hypotheses that are fitted in a round
+GAIN = 5.0
+"""Gain of the linearised cost from which a hypothesis is fitted: a third of the gain that calibration accepts."""
+COARSE = 2.0
+"""Times the deviation that counts as wrong in a calibration, below which constants are no finding here."""
+
+
+def of_constants(streams: Streams, name: str, truth: bool) -> Iterator[Finding]:
+    """Yield wrong constants of a car: camera, wheels, gyro, clocks and markers; `truth`: motion capture counts."""
+    try:
+        drive = drive_of_streams(streams, name, [name])
+        if not np.ptp(drive.places, axis=0).any():
+            return
+        batch = Batch(drive, truth)
+        pairs = exchanged(batch)
+        for i, j in pairs:
+            text = f"markers {drive.landmarks[i]} and {drive.landmarks[j]} are exchanged"
+            yield Finding("markers", text, treatment=Treatment.REFUSED, car=name)
+        blind = not any(batch.truth)
+        if blind and (found := _coarse(drive, name, BAD)):
+            yield found
+            return
+        given = batch.fit(batch.begin())
+        fit = corrected(batch, given, TRIED, GAIN)
+        if lines := [*unexplained(batch, fit)]:
+            cause = _coarse(drive, name, 0.0) if blind else None
+            yield cause or Finding(name, lines[0].partition(": ")[2], car=name, explained=False)
+            return
+        yield from _wrong(batch, fit, name)
+    except (DataError, np.linalg.LinAlgError):  # too short a drive, or one that determines no pose
+        return
+
+
+def _wrong(batch: Batch, fit: Fit, name: str) -> Iterator[Finding]:
+    """Yield a finding per part of the car or the map with wrong constants."""
+    error = errors(batch, fit)
+    bad, _ = wrong(batch, fit, error, COARSE)
+    for title, part in parts_of(batch).items():
+        rows = [n for n in part if bad[n]]
+        changes = []
+        for n in rows:
+            kind, factor = batch.kinds[n], math.degrees(1.0) if batch.kinds[n].unit == "deg" else 1.0
+            old, new = factor * batch.base[n], factor * (batch.base[n] + fit.x[n])
+            changes.append(
+                f"{kind.name.split('.', 1)[1]} {old:.4g} -> {new:.4g} +- {factor * error[n]:.2g} {kind.unit}".rstrip()
+            )
+        if rows:
+            worst = max(rows, key=lambda n: abs(fit.x[n]) / error[n])
+            text = f"a wrong constant: {', '.join(changes)}"
+            key = "the file of `coopenv calibrate` (calibration = ...)"
+            yield Finding(title, text, float(fit.x[worst]), float(error[worst]), key, car=name)
+
+
+def _coarse(drive: CalibrationDrive, name: str, bad: float) -> Finding | None:
+    """Return the cause of a misfit above `bad` without motion capture; None: there is no such misfit, or no cause."""
+    (car,) = drive.cars
+    if (given := _windows(drive, car)) < bad:
+        return None
+    best, text = min((_windows(drive, changed, places), text) for text, changed, places in _changes(drive, car))
+    return Finding(name, text, treatment=Treatment.REFUSED, car=name) if best < REMOVED * given else None
+
+
+def _windows(drive: CalibrationDrive, car: CarDrive, places: np.ndarray | None = None) -> float:
+    """Return the mean misfit of bearings in windows of dead reckoning."""
+    batch = Batch(replace(drive, cars=(car,), places=drive.places if places is None else places), False)
+    return batch.resected(0, np.arange(len(drive.places)))[1]
+
+
+def _changes(drive: CalibrationDrive, car: CarDrive) -> Iterator[tuple[str, CarDrive, np.ndarray]]:
+    """Yield causes, and the streams and the map without them."""
+    places = drive.places
+    for what, factor in SPEED_FACTORS.items():
+        wheel = car.wheel / factor
+        yield (
+            f"the velocity of {car.name} is {factor:.4g} times that by bearings ({what})",
+            replace(car, wheel=wheel),
+            places,
+        )
+    for what, signs in (("image is mirrored", [-1.0, 1.0, 1.0]), ("image is upside down", [-1.0, -1.0, 1.0])):
+        yield f"its {what}", replace(car, ray=car.ray * signs), places
+    if (lens := car.lens) is not None:
+        for factor in (0.5, 2.0):
+            fx, fy, cx, cy = (factor * value for value in (*lens.focal_length, *lens.principal_point))
+            right = replace(lens, focal_length=(fx, fy), principal_point=(cx, cy), image_size=(100_000, 100_000))
+            ray, there = rays(car.pixel, right)
+            names = ("time", "target", "pixel")
+            seen: dict[str, Any] = {name: getattr(car, name)[there] for name in names} | {"ray": ray[there]}
+            yield f"its focal length is {1.0 / factor:g} times that of its images", replace(car, **seen), places
+    for what, signs in (("x", [-1.0, 1.0, 1.0]), ("y", [1.0, -1.0, 1.0])):
+        yield f"the map is mirrored: {what} has the other sign", car, places * signs
+    for unit, metres in (("mm", 1e-3), ("cm", 1e-2)):
+        yield f"positions of landmarks are in {unit}, and not in m", car, places * metres

@@ -1,0 +1,51 @@
+"""A finding: one stream that the others contradict, by how much, the key that mends it, and the treatment."""
+
+from dataclasses import dataclass
+from enum import Enum
+from math import ceil, floor, log10
+
+
+class Treatment(Enum):
+    """Treatment of a stream that others contradict."""
+
+    USED = "used unchanged"
+    MENDED = "mended"
+    LEFT_OUT = "left out"
+    REFUSED = "refused"
+    TRUSTED = "trusted"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A contradiction between streams. Texts are of one line."""
+
+    subject: str
+    """The stream that is wrong: a topic, a clock, the map of landmarks or markers."""
+    text: str
+    """The contradiction, its size included."""
+    size: float | None = None
+    """The number that is wrong, in the unit of the text."""
+    error: float | None = None
+    """Its standard error."""
+    key: str = ""
+    """Key of the topic map or the environment that mends it, with its value."""
+    treatment: Treatment = Treatment.USED
+    car: str = ""
+    explained: bool = True
+    """Whether one cause explains it."""
+
+    def __str__(self) -> str:
+        """Return the finding as a line."""
+        subject = f"topic {self.subject}" if self.subject.startswith("/") else self.subject
+        mended = self.treatment is Treatment.MENDED
+        key = f"; {'mended, as with' if mended else 'mended by'} {self.key}" if self.key else ""
+        return f"{subject}: {self.text}{key}{'; trusted' if self.treatment is Treatment.TRUSTED else ''}"
+
+
+def with_error(value: float, error: float) -> str:
+    """Return a value with its standard error in brackets, in units of the last digit: 57.31(4)."""
+    if not error > 0.0:
+        return f"{value:.4g}"
+    digits = max(0, -floor(log10(error)))
+    digits = max(0, digits - (ceil(error * 10**digits) > 9))
+    return f"{value:.{digits}f}({ceil(round(error * 10**digits, 6))})" if digits < 9 else f"{value:.4g}"

@@ -1,0 +1,91 @@
+"""The gate for live cars: the same checks, on a window of the last samples."""
+
+from collections import deque
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from coopenv.cars.backend.binding import Binding
+from coopenv.cars.doctor.doctor import examine_motion, examine_sight
+from coopenv.cars.doctor.finding import Finding, Treatment
+from coopenv.cars.doctor.streams import Streams
+from coopenv.cars.doctor.turning import turn_contradiction
+from coopenv.cars.messages.readings import Sample, Twist
+
+KEPT = 3_000  # samples of a car, some 10 s
+MOVED = 0.3  # m
+LASTS = 1_000_000_000  # ns for which a result holds
+
+
+class StreamMonitor:
+    """The last samples of live cars, and what contradicts in them.
+
+    A finding stands until its car has moved without it.
+    """
+
+    def __init__(self, binding: Binding, trusted: Collection[str] = ()) -> None:
+        """Begin without samples; `trusted` are subjects of findings that do not count."""
+        self._binding, self._trusted = binding, trusted
+        self._kept = {car: deque[Sample](maxlen=KEPT) for car in binding.cars}
+        self._rates: dict[str, float] = {}
+        self._turning: set[str] = set()
+        self._looked = 0
+        self._found: dict[str, list[Finding]] = {}
+
+    def begin(self) -> None:
+        """Forget the samples, as cars are moved to another place; a turn rate that never changed stays known."""
+        self.findings()
+        for car in self._turning:
+            self._kept[car].clear()
+
+    def put(self, sample: Sample) -> None:
+        """Take a sample, with the turn rate that is used, or a command."""
+        if sample.car not in self._kept:
+            return
+        if isinstance(sample.value, Twist) and sample.value.angular is not None:
+            rate = float(sample.value.angular[2])
+            if self._rates.setdefault(sample.car, rate) != rate:
+                self._turning.add(sample.car)
+        self._kept[sample.car].append(sample)
+
+    def contradiction(self, car: str) -> str | None:
+        """Return what contradicts a turn rate that never changes, see `turn_contradiction`."""
+        return None if car in self._turning else turn_contradiction([*self._kept[car]], self._binding, car)
+
+    def findings(self) -> list[Finding]:
+        """Return the streams that others contradict; a result holds for a second of the samples."""
+        samples = sorted((s for kept in self._kept.values() for s in kept), key=lambda sample: sample.stamp)
+        now = max((sample.received for sample in samples), default=0)
+        if now > self._looked + LASTS:
+            self._looked = now
+            self._found |= examined(samples, self._binding, self._trusted)
+        return [finding for found in self._found.values() for finding in found]
+
+
+def examined(samples: Sequence[Sample], binding: Binding, trusted: Collection[str] = ()) -> dict[str, list[Finding]]:
+    """Return, of live cars that have moved, the streams that others contradict by a known cause; nothing is mended.
+
+    Contradictions without a known cause are the watchdog's, which compares estimates. From one place many causes look
+    alike, so that cars that have stood are left out.
+
+    Args:
+        samples: in the order of their stamps.
+        binding: of the fleet.
+        trusted: subjects of findings that do not count.
+    """
+    roles = {(s.car, s.role) for s in samples if s.role in binding.profile.topics}
+    topics = {(car, role): binding.profile.topic_of(car, role) for car, role in roles}
+    streams = Streams(samples, binding, topics)
+    moved = [name for name in binding.cars if _moved(streams, name)]
+    if not moved:
+        return {}
+    found = [*examine_motion(streams, trusted).findings, *examine_sight(streams, trusted)]
+    counted = [f for f in found if f.explained and f.treatment not in (Treatment.TRUSTED, Treatment.LEFT_OUT)]
+    return {car: [replace(f, treatment=Treatment.REFUSED) for f in counted if f.car == car] for car in moved}
+
+
+def _moved(streams: Streams, name: str) -> bool:
+    """Return whether a car has moved, by motion capture."""
+    place = streams.car(name).tracks["truth"]
+    return bool(np.abs(place - place[:1]).max(initial=0.0) > MOVED)

@@ -1,0 +1,313 @@
+"""Checks of turn rates and velocities: against motion capture, bearings, their own poses, and commands."""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coopenv.cars.bags.clocks import SampledSignal, turn_of
+from coopenv.cars.doctor.finding import Finding, Treatment, with_error
+from coopenv.cars.doctor.relation import Relation, intervals, relation
+from coopenv.cars.doctor.streams import MOVING, TURNING, CarStreams
+from coopenv.cars.doctor.turning import TURNED
+from coopenv.cars.settings.profile import Role
+from coopenv.estimation.poses import Array
+
+FACTORS = {
+    "the other sign": -1.0,
+    "deg/s instead of rad/s": math.degrees(1.0),
+    "deg/s instead of rad/s, with the other sign": -math.degrees(1.0),
+    "converted to rad/s twice": math.radians(1.0),
+    "turns per second instead of rad/s": 0.5 / math.pi,
+}
+"""Wrong factors of turn rates by their names."""
+SPEED_FACTORS = {
+    "the other sign": -1.0,
+    "km/h instead of m/s": 3.6,
+    "mm/s instead of m/s": 1000.0,
+    "cm/s instead of m/s": 100.0,
+    "m/s taken for km/h": 1.0 / 3.6,
+    "mm/s taken for m/s": 0.001,
+    "cm/s taken for m/s": 0.01,
+}
+"""Wrong factors of speeds."""
+NAMED = 0.15
+"""Relative distance of a factor from a named one: three standard deviations of a wheel's scale of 5 %."""
+TRANSLATED = 0.3
+"""The same by bearings, whose turns contain translation."""
+TURNS = 0.05
+"""rad, least standard deviation of turns over an interval at which turn rates are compared."""
+MOVES = 0.05
+"""m, likewise of displacements."""
+FOLLOWS = 0.6
+"""Share of the variance that a right stream explains at least; noise takes under 0.1 at `TURNS` and `MOVES`."""
+SURE, LAGS = 0.9, (*np.arange(-1.0, 0.0, 0.1), *np.arange(0.1, 1.05, 0.1))
+"""Share of the variance from which no other lag is tried, and lags, s."""
+LEAST = 0.05
+"""Practical size: a scale by which 20 s of driving at 0.3 m/s are 0.3 m off without bearings."""
+
+
+def body_rays(car: CarStreams, mounting: Array) -> Array:
+    """Return the rays (m, 3) of sightings in the body frame."""
+    return car.ray @ mounting.T
+
+
+def bearing_turn(car: CarStreams, mounting: Array) -> SampledSignal | None:
+    """Return the heading by the median change of the azimuths of landmarks, translation included; None: too few."""
+    if len(car.time) < 2:
+        return None
+    body = body_rays(car, mounting)
+    places = np.stack([car.target.astype(np.float64), np.zeros(len(car.target))], axis=-1)
+    return turn_of(car.time, np.arctan2(body[:, 1], body[:, 0]), places)
+
+
+def truth_signals(car: CarStreams) -> tuple[SampledSignal, SampledSignal] | None:
+    """Return place (x, y) and heading by motion capture; None: there is too little."""
+    time, place, yaw = (car.tracks[name] for name in ("truth_time", "truth", "truth_yaw"))
+    if len(time) < 2:
+        return None
+    return SampledSignal(time, np.column_stack([place.real, place.imag])), SampledSignal(time, np.unwrap(yaw))
+
+
+def own_signals(car: CarStreams) -> tuple[SampledSignal, SampledSignal] | None:
+    """Return place and heading by the poses of the odometry's own messages; None: it has none, or they never change."""
+    if len(car.pose_time) < 2 or np.ptp(np.abs(car.pose - car.pose[0])) == 0.0:
+        return None
+    place = np.column_stack([car.pose.real, car.pose.imag])
+    return SampledSignal(car.pose_time, place), SampledSignal(car.pose_time, car.pose_yaw)
+
+
+def turning_factor(car: CarStreams, heading: SampledSignal, axis: int = 2) -> Relation | None:
+    """Return the turn rates about an axis as a multiple of those of a heading; None: too few, or it hardly turns."""
+    time = car.tracks["gyro_time"]
+    if len(time) < 2:
+        return None
+    measured = SampledSignal.of_rates(time, car.turning[:, axis])
+    begin, end = intervals(measured, heading)
+    turned = heading.over(begin, end)[:, 0]
+    if not np.isfinite(turned).any() or float(np.nanstd(turned)) < TURNS:
+        return None
+    return at_best(lambda lag: relation(begin, measured.over(begin + lag, end + lag)[:, 0], turned))
+
+
+def named(factor: float, factors: dict[str, float], within: float = NAMED) -> tuple[str, float] | None:
+    """Return the name of a factor and its exact value, from which it may differ by a share; None: it has none."""
+    close = [(name, value) for name, value in factors.items() if abs(factor / value - 1.0) < within]
+    return close[0] if close else None
+
+
+def of_turning(car: CarStreams, mounting: Array, practical: float, use_truth: bool) -> Iterator[Finding]:
+    """Yield what is wrong with sign, unit and axes of turn rates.
+
+    Without motion capture bearings are the reference; translation then explains factors between 0.5 and 2.
+    """
+    topic, seen = car.topic(TURNING), bearing_turn(car, mounting)
+    truth, own = truth_signals(car), own_signals(car)
+    if truth is not None and use_truth:
+        reference, what, least = truth[1], "motion capture", practical
+    elif own is not None:
+        reference, what, least = own[1], "its own poses", practical
+    elif seen is not None:
+        reference, what, least = seen, "bearings", 1.0
+    else:
+        return
+    found = turning_factor(car, reference)
+    if found is None:
+        return
+    factor = found.factor.real
+    if found.explained < FOLLOWS:
+        yield from _other_axis(car, reference, what, topic, found)
+        return
+    if not found.differs(least) or (what == "bearings" and 0.5 < factor < 2.0):
+        return
+    known = named(factor, FACTORS, TRANSLATED if what == "bearings" else NAMED)
+    size = with_error(factor, found.error)
+    text = f"the turn rate of {car.name} is {size} times that of {what}"
+    if known is None:
+        key = f"corrections.{car.name}.gyro_factor = {1.0 / factor:.4g}"
+        yield Finding(topic, text, factor, found.error, key, Treatment.REFUSED, car.name)
+        return
+    key = f"corrections.{car.name}.gyro_factor = {1.0 / known[1]:.6g}"
+    yield Finding(topic, f"{text} ({known[0]})", factor, found.error, key, Treatment.MENDED, car.name)
+
+
+def turns_contradict(car: CarStreams, mounting: Array) -> bool:
+    """Return whether turns by motion capture contradict both bearings and turn rates, which agree with each other."""
+    truth, seen = truth_signals(car), bearing_turn(car, mounting)
+    if truth is None or seen is None:
+        return False
+    by_truth, by_bearings = turning_factor(car, truth[1]), turning_factor(car, seen)
+    if by_truth is None or by_bearings is None or by_bearings.explained < FOLLOWS:
+        return False
+    agree = 0.5 < by_bearings.factor.real < 2.0
+    return agree and (by_truth.explained < FOLLOWS or not 0.5 < by_truth.factor.real < 2.0)
+
+
+def _other_axis(car: CarStreams, reference: SampledSignal, what: str, topic: str, found: Relation) -> Iterator[Finding]:
+    """Yield which axis measures the turns of a car, or that no axis does."""
+    for axis, name in enumerate("xy"):
+        other = turning_factor(car, reference, axis)
+        if other is not None and other.explained > FOLLOWS:
+            size = with_error(other.factor.real, other.error)
+            text = f"{car.name} turns about the {name} axis of its gyro ({size} times {what}), and not about z"
+            yield Finding(topic, text, other.factor.real, other.error, "", Treatment.REFUSED, car.name)
+            return
+    if what != "bearings":
+        text = f"the turn rate of {car.name} does not follow {what}: it explains {max(0.0, found.explained):.0%} of it"
+        yield Finding(topic, text, found.factor.real, found.error, car=car.name, explained=False)
+
+
+def velocity_relations(
+    car: CarStreams, place: SampledSignal, heading: SampledSignal
+) -> tuple[Relation | None, Relation | None]:
+    """Return measured displacements as multiples of those of a path, in its body frame and in its map; None: too few.
+
+    A turn about another point on the axis of the car moves the body to the side, too, and is fitted with it.
+    """
+    time, velocity = car.tracks["wheel_time"], car.tracks["wheel"]
+    if len(time) < 2:
+        return None, None
+    measured = SampledSignal(
+        time,
+        np.column_stack([SampledSignal.of_rates(time, part).values[:, 0] for part in (velocity.real, velocity.imag)]),
+    )
+    begin, end = intervals(measured, place, heading)
+    middle, turn = heading.over(begin, 0.5 * (begin + end), level=True)[:, 0], heading.over(begin, end)[:, 0]
+    true = _planar(place.over(begin, end))
+    known = np.isfinite(true)
+    if not known.any() or float(np.sqrt(np.mean(np.abs(true[known]) ** 2))) < MOVES:
+        return None, None
+    body = true * np.exp(-1j * middle)
+
+    def moved(lag: float) -> NDArray[np.complex128]:
+        return _planar(measured.over(begin + lag, end + lag))
+
+    return (
+        at_best(lambda lag: relation(begin, moved(lag), body, 1j * turn)),
+        at_best(lambda lag: relation(begin, moved(lag), true)),
+    )
+
+
+def at_best(related: Callable[[float], Relation | None]) -> Relation | None:
+    """Return the relation of streams at the lag, s, at which it explains most; clocks are looked at elsewhere."""
+    found = related(0.0)
+    if found is None or found.explained > SURE:
+        return found
+    others = [other for lag in LAGS if (other := related(lag)) is not None]
+    return max([found, *others], key=lambda each: each.explained)
+
+
+def _planar(change: Array) -> NDArray[np.complex128]:
+    return np.asarray(change[:, 0] + 1j * change[:, 1])
+
+
+def of_velocity(car: CarStreams, practical: float, use_truth: bool) -> Iterator[Finding]:
+    """Yield what is wrong with sign, unit, axes and frame of velocities.
+
+    Args:
+        car: its streams.
+        practical: relative scale up to which a scale is no finding.
+        use_truth: whether motion capture is a reference.
+    """
+    topic, truth, own = car.topic(MOVING), truth_signals(car) if use_truth else None, own_signals(car)
+    for paths, what in ((own, "its own poses"), (truth, "motion capture")):
+        if paths is None:
+            continue
+        body, room = velocity_relations(car, *paths)
+        if body is None or room is None:
+            continue
+        if room.explained > FOLLOWS and (1.0 - room.explained) < 0.5 * (1.0 - body.explained):
+            yield _in_the_room(car, topic, what, room, own is paths)
+            return
+        if body.explained < FOLLOWS:
+            text = (
+                f"the velocity of {car.name} does not follow {what}: it explains {max(0.0, body.explained):.0%} of it"
+            )
+            yield Finding(topic, text, body.explained, car=car.name, explained=False)
+            return
+        if body.differs(practical):
+            yield _velocity(car, topic, what, body)
+            return
+
+
+def _in_the_room(car: CarStreams, topic: str, what: str, room: Relation, own: bool) -> Finding:
+    """Return the finding of velocities in the frame of the map."""
+    angle = math.degrees(float(np.angle(room.factor)))
+    turned = f", turned by {angle:.0f} deg" if abs(angle) > 3.0 else ""
+    text = (
+        f"the velocity of {car.name} is in the frame of {what}{turned}, and not in the car's: "
+        f"{with_error(abs(room.factor), room.error)} times the motion there, {room.explained:.0%} explained"
+    )
+    treatment = Treatment.MENDED if own and not turned else Treatment.REFUSED
+    key = "its own poses, which turn it" if own and not turned else ""
+    return Finding(topic, text, abs(room.factor), room.error, key, treatment, car.name)
+
+
+def _velocity(car: CarStreams, topic: str, what: str, body: Relation) -> Finding:
+    """Return the finding of a wrong sign, unit, scale or direction of velocities."""
+    size, angle = abs(body.factor), math.degrees(float(np.angle(body.factor)))
+    signed = size if abs(angle) < 90.0 else -size
+    if abs(math.sin(math.radians(angle))) > 0.3:
+        shown = with_error(angle, math.degrees(body.error / size))
+        text = f"the velocity of {car.name} points {shown} deg to the left of the motion by {what}: other axes"
+        return Finding(topic, text, angle, math.degrees(body.error / size), "", Treatment.REFUSED, car.name)
+    known = named(signed, SPEED_FACTORS)
+    exact = signed if known is None else known[1]
+    text = f"the velocity of {car.name} is {with_error(signed, body.error)} times that of {what}"
+    key = f"corrections.{car.name}.wheel_factor = {1.0 / exact:.6g}"
+    if known is not None:
+        return Finding(topic, f"{text} ({known[0]})", signed, body.error, key, Treatment.MENDED, car.name)
+    far = abs(size - 1.0) > 0.3
+    return Finding(topic, text, signed, body.error, key, Treatment.REFUSED if far else Treatment.USED, car.name)
+
+
+FROZEN = 1.0
+"""s, least duration of equal values in a row."""
+STUCK = 0.15
+"""m by which a position by wheels and one by motion capture may differ over such a time, 0.15 m/s for a second."""
+
+
+def of_frozen_streams(car: CarStreams) -> Iterator[Finding]:
+    """Yield streams that repeat a value while another one shows that the car moves."""
+    wheel_time, wheel, gyro_time, gyro = (car.tracks[name] for name in ("wheel_time", "wheel", "gyro_time", "gyro"))
+    truth_time, place, yaw = (car.tracks[name] for name in ("truth_time", "truth", "truth_yaw"))
+    if len(truth_time) < 3 or len(wheel_time) < 2:
+        return
+    begin, end, _ = frozen(wheel_time, wheel)
+    inside = (truth_time >= begin) & (truth_time <= end)
+    if end - begin > FROZEN and inside.sum() > 2:
+        speed = float(abs(wheel[wheel_time == begin][0]))
+        way, claimed = float(np.abs(np.diff(place[inside][::5])).sum()), speed * (end - begin)
+        if (
+            abs(way - claimed) > max(STUCK, 0.1 * way)
+            and max(claimed, float(np.ptp(np.abs(place[inside] - place[inside][0])))) > STUCK
+        ):
+            text = f"the velocity of {car.name} is {speed:.3g} m/s in a row for {end - begin:.1f} s, in which "
+            text += f"motion capture moves it by {way:.2f} m"
+            yield Finding(car.topic(MOVING), text, way - claimed, None, "", Treatment.REFUSED, car.name)
+    if len(gyro_time) > 1:
+        begin, end, _ = frozen(gyro_time, gyro)
+        inside = (truth_time >= begin) & (truth_time <= end)
+        if end - begin > FROZEN and inside.sum() > 2:
+            rate = float(gyro[gyro_time == begin][0]) + 0.0  # no negative zero
+            turned = float(np.ptp(np.unwrap(yaw[inside]) - rate * truth_time[inside]))
+            if turned > TURNED:
+                text = f"the turn rate of {car.name} is {rate:.3g} rad/s in a row for {end - begin:.1f} s, in which "
+                text += f"motion capture turns it by {math.degrees(turned):.0f} deg"
+                yield Finding(car.topic(TURNING), text, turned, None, "", Treatment.REFUSED, car.name)
+    begin, end, _ = frozen(truth_time, place + 1e3 * yaw)
+    moving = (wheel_time >= begin) & (wheel_time <= end)
+    way = float(np.abs(wheel[moving]).mean() * (end - begin)) if moving.any() else 0.0
+    if end - begin > FROZEN and way > 2.0 * STUCK:
+        text = f"motion capture repeats one pose of {car.name} for {end - begin:.1f} s, in which its wheels move it by "
+        yield Finding(car.topic([Role.TRUTH]), f"{text}{way:.2f} m", way, None, "", Treatment.LEFT_OUT, car.name)
+
+
+def frozen(time: Array, values: NDArray[Any]) -> tuple[float, float, int]:
+    """Return begin and end, s, of the longest run of equal values (n,), n > 0, and the number of its messages."""
+    ends = np.flatnonzero(np.append(np.diff(values) != 0.0, True))
+    begins = np.append(0, ends[:-1] + 1)
+    best = int(np.argmax(ends - begins))
+    return float(time[begins[best]]), float(time[ends[best]]), int(ends[best] - begins[best]) + 1

@@ -1,0 +1,284 @@
+"""The gate on drives that are computed here: each fault is named by its cause, and sound drives are silent."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coopenv.cars.backend.binding import Binding, bind
+from coopenv.cars.doctor.doctor import examine_map, examine_motion
+from coopenv.cars.doctor.finding import Treatment, with_error
+from coopenv.cars.doctor.live import StreamMonitor
+from coopenv.cars.doctor.relation import relation
+from coopenv.cars.doctor.streams import Streams
+from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.deployment import Car
+from coopenv.cars.settings.profile import Role
+from coopenv.scenario import load_scenario
+
+PLACES = np.array([[0.3, 2.6, 0.45], [-1.9, 2.2, 0.08], [2.1, 1.5, 0.25], [2.4, -1.3, 0.5], [-0.8, -2.3, 0.3]])
+NAMES = ("SL1", "SL2", "SL4", "SL5", "ML")
+LENS = Calibration((316, 208), (213.0, 213.0), (158.0, 104.0), (0.0,) * 5)
+LEVER = np.array([0.3218, 0.0, 0.2233])
+AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+S = 1_000_000_000
+
+
+def turn(yaw: float) -> np.ndarray:
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def binding(places: np.ndarray = PLACES) -> Binding:
+    """A car among five standing landmarks, whose camera looks ahead and has no distortion."""
+    overrides: dict[str, Any] = {f"landmarks.{n}.position": p.tolist() for n, p in zip(NAMES, places, strict=True)}
+    overrides |= {"camera.distortion": [0.0] * 5, "camera.focal_length": [213.0, 213.0]}
+    overrides |= {"camera.principal_point": [158.0, 104.0], "landmarks.ML.motion": {"kind": "static"}}
+    overrides |= {f"landmarks.{n}.marker": [0.0, 0.0, 0.0] for n in NAMES}
+    scenario = load_scenario("svea_crossing", overrides)
+    return bind(scenario, (Car(name="car", marker=9),), {n: k + 1 for k, n in enumerate(NAMES)}, "here", None)
+
+
+@cache
+def driven(seed: int = 0, seconds: float = 24.0) -> tuple[Sample, ...]:
+    """Return the samples of a car that drives loops among the landmarks, by formulas of its own."""
+    rng, dt = np.random.default_rng(seed), 0.005
+    t = np.arange(0.0, seconds, dt)
+    speed = 0.5 + 0.2 * np.sin(0.9 * t + seed)
+    rate = 0.5 + 0.7 * np.sin(2.0 * np.pi * t / 7.0 + seed)
+    yaw = 1.0 + seed + np.cumsum(rate) * dt
+    place = np.cumsum(speed * np.exp(1j * yaw)) * dt
+    place -= 0.5 * (place.real.min() + place.real.max()) + 0.5j * (place.imag.min() + place.imag.max())
+    found = []
+
+    def sample(role: Role, k: int, value: Any) -> None:
+        found.append(Sample("car", role, S + round(S * t[k]), S + round(S * t[k]), value))
+
+    for k in range(0, len(t), 2):
+        turning = 0.01 * rng.normal(size=3) + [0.0, 0.0, rate[k] + 0.003]
+        sample(Role.IMU, k, Twist(None, turning))
+    for k in range(1, len(t), 4):
+        sample(Role.WHEEL, k, Twist(np.array([1.01 * speed[k] + 0.01 * rng.normal(), 0.0, 0.0]), None))
+        noise = 0.0005 * rng.normal(size=2)
+        at = np.array([place[k].real + noise[0], place[k].imag + noise[1], 0.0])
+        sample(Role.TRUTH, k, CarPose(at, turn(yaw[k] + 0.001 * rng.normal())))
+    for k in range(2, len(t), 6):
+        ray = ((PLACES - [place[k].real, place[k].imag, 0.0]) @ turn(yaw[k]) - LEVER) @ AHEAD
+        pixel = np.rint(
+            213.0 * ray[:, :2] / np.maximum(ray[:, 2:], 1e-3) + [158.0, 104.0] + rng.normal(size=(5, 2)) * 0.4
+        )
+        seen = np.flatnonzero((ray[:, 2] > 0.3) & ((pixel >= 0.0) & (pixel < [316.0, 208.0])).all(axis=1))
+        units = np.column_stack([(pixel[seen] - [158.0, 104.0]) / 213.0, np.ones(len(seen))])
+        units /= np.linalg.norm(units, axis=1, keepdims=True)
+        sample(Role.DETECTIONS, k, Detections(tuple((seen + 1).tolist()), units))
+    return tuple(sorted(found, key=lambda one: one.stamp))
+
+
+Change = Callable[[Any, float], Any]
+
+
+def twist(linear: float = 1.0, angular: float = 1.0, after: float = 0.0) -> Change:
+    def change(value: Any, t: float) -> Any:
+        if not isinstance(value, Twist) or t < after:
+            return value
+        v, w = value.linear, value.angular
+        return Twist(None if v is None else linear * v, None if w is None else angular * w)
+
+    return change
+
+
+def axes(value: Any, _: float) -> Any:
+    return replace(value, angular=value.angular[::-1]) if getattr(value, "angular", None) is not None else value
+
+
+def pose(place: Callable[[np.ndarray], np.ndarray], heading: Callable[[float], float]) -> Change:
+    def change(value: Any, _: float) -> Any:
+        if not isinstance(value, CarPose) or value.rotation is None:
+            return value
+        return CarPose(place(value.position), turn(heading(float(np.arctan2(*value.rotation[1::-1, 0])))))
+
+    return change
+
+
+def seen(ray: Callable[[np.ndarray], np.ndarray], number: Callable[[int], int] = int) -> Change:
+    def change(value: Any, _: float) -> Any:
+        if not isinstance(value, Detections):
+            return value
+        units = ray(value.bearings.copy()) if len(value.bearings) else value.bearings
+        units = units / np.linalg.norm(units, axis=1, keepdims=True)
+        return Detections(tuple(map(number, value.markers)), units)
+
+    return change
+
+
+def stuck(value: Any, t: float) -> Any:
+    return CarPose(np.array([0.3, 0.2, 0.0]), turn(1.0)) if isinstance(value, CarPose) and 8.0 < t < 14.0 else value
+
+
+def same(value: Any) -> Any:
+    return value
+
+
+def narrow(factor: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda ray: ray * [1.0 / factor, 1.0 / factor, 1.0]
+
+
+FAULTS: dict[str, tuple[Change, str, Treatment | None]] = {
+    "gyro reversed": (
+        twist(angular=-1.0),
+        r"turn rate of car is -[01]\.\d+\(\d+\) times .* other sign",
+        Treatment.MENDED,
+    ),
+    "gyro in degrees": (twist(angular=57.29578), "turn rate .*deg/s instead of rad/s", Treatment.MENDED),
+    "gyro of a wrong scale": (twist(angular=1.3), r"turn rate of car is 1\.(30|29)\d*\(", Treatment.REFUSED),
+    "gyro is zero": (twist(angular=0.0), "turn rate of car is 0 rad/s in all", Treatment.REFUSED),
+    "gyro ends": (twist(angular=0.0, after=12.0), "turn rate of car is 0 rad/s in a row for 12", Treatment.REFUSED),
+    "gyro with other axes": (axes, "turns about the x axis", Treatment.REFUSED),
+    "wheels reversed": (twist(linear=-1.0), "velocity of car .* other sign", Treatment.MENDED),
+    "wheels in km/h": (twist(linear=3.6), "velocity of car .*km/h instead of m/s", Treatment.MENDED),
+    "wheels end": (twist(linear=0.0, after=12.0), "velocity of car is 0 m/s in a row", Treatment.REFUSED),
+    "truth in mm": (pose(lambda p: 1000.0 * p, float), "motion capture of car.* it is in mm", Treatment.USED),
+    "truth mirrored": (pose(lambda p: p * [1, -1, 1], lambda a: -a), "motion capture .* mirrored", Treatment.USED),
+    "truth in another frame": (
+        pose(lambda p: turn(0.6) @ p + [1.0, 0.0, 0.0], lambda a: a + 0.6),
+        r"its frame is -34\.\d deg",
+        Treatment.USED,
+    ),
+    "body of truth turned": (pose(same, lambda a: a + np.pi / 2), "its body is turned by 90 deg", Treatment.USED),
+    "truth stuck": (stuck, r"repeats one pose of car for 6\.0 s", Treatment.LEFT_OUT),
+    "image mirrored": (seen(lambda ray: ray * [-1, 1, 1]), "its image is mirrored", Treatment.REFUSED),
+    "twice the focal length": (seen(narrow(2.0)), r"focal length is (2\.0|1\.9)\d*\(\d+\) times", Treatment.REFUSED),
+    "markers exchanged": (seen(same, lambda n: {1: 4, 4: 1}.get(n, n)), "SL1 and SL5 are exchanged", Treatment.REFUSED),
+    "focal length 3 % off": (seen(narrow(1.03)), "focal length: a wrong constant", Treatment.USED),
+    "camera to the right": (
+        seen(lambda ray: ray @ np.array([[0.9962, 0, 0.0872], [0, 1, 0], [-0.0872, 0, 0.9962]])),
+        "camera orientation|mounting is 5",
+        None,
+    ),
+}
+"""Changes of values, words of the true cause, and the treatment (None: either)."""
+
+
+def streams_of(change: Change | None, truth: bool = True, seed: int = 0, places: np.ndarray = PLACES) -> Streams:
+    """Return the streams of a drive with a fault."""
+    given = [s for s in driven(seed) if truth or s.role is not Role.TRUTH]
+    if change is not None:
+        given = [replace(s, value=change(s.value, 1e-9 * s.stamp - 1.0)) for s in given]
+    topics = {("car", s.role): f"/car/{s.role.value}" for s in given}
+    return Streams(given, binding(places), topics, {"car": LENS})
+
+
+def findings_of(streams: Streams, trusted: tuple[str, ...] = ()) -> list[Any]:
+    moving = examine_motion(streams, trusted)
+    mended = replace(streams, samples=moving.mended(streams.samples))
+    return [*moving.findings, *examine_map(mended, moving.findings, trusted)]
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_is_named_by_its_cause(name: str) -> None:
+    change, words, treatment = FAULTS[name]
+    found = findings_of(streams_of(change))
+    named = [finding for finding in found if re.search(words, str(finding))]
+    assert named, [str(finding) for finding in found]
+    assert treatment in (None, named[0].treatment)
+    assert len(found) == len(named), [str(finding) for finding in found]
+
+
+@pytest.mark.parametrize("truth", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_sound_drive_is_silent(truth: bool, seed: int) -> None:
+    assert not [str(finding) for finding in findings_of(streams_of(None, truth, seed))]
+
+
+BLIND = ("gyro reversed", "gyro in degrees", "gyro is zero", "wheels reversed", "markers exchanged")
+
+
+@pytest.mark.parametrize("name", BLIND)
+def test_bearings_name_a_fault_without_motion_capture(name: str) -> None:
+    change, words, _ = FAULTS[name]
+    assert any(re.search(words, str(finding)) for finding in findings_of(streams_of(change, truth=False)))
+
+
+@pytest.mark.parametrize(
+    ("move", "words"),
+    [(lambda p: 100.0 * p, "in cm, and not in m"), (lambda p: p * [-1, 1, 1], "map is mirrored: x")],
+)
+def test_a_wrong_map_is_named(move: Callable[[np.ndarray], np.ndarray], words: str) -> None:
+    [found] = findings_of(streams_of(None, places=move(PLACES)))
+    assert found.subject == "landmarks" and words in found.text and found.treatment is Treatment.REFUSED
+
+
+def test_two_faults_are_both_named() -> None:
+    mirrored, swapped = FAULTS["image mirrored"][0], FAULTS["markers exchanged"][0]
+
+    def change(value: Any, t: float) -> Any:
+        return swapped(mirrored(FAULTS["gyro reversed"][0](value, t), t), t)
+
+    text = "\n".join(map(str, findings_of(streams_of(change))))
+    assert all(re.search(FAULTS[name][1], text) for name in ("gyro reversed", "image mirrored", "markers exchanged"))
+
+
+def test_mended_turn_rates_are_those_of_the_sound_drive() -> None:
+    streams = streams_of(FAULTS["gyro in degrees"][0])
+    mended = examine_motion(streams).mended(streams.samples)
+    rates = [s.value.angular for s in mended if s.role is Role.IMU]
+    np.testing.assert_allclose(rates, [s.value.angular for s in driven() if s.role is Role.IMU], rtol=1e-6)
+
+
+def test_a_trusted_topic_stays_unchanged_and_is_named() -> None:
+    streams = streams_of(FAULTS["gyro reversed"][0])
+    [found] = (moving := examine_motion(streams, ("/car/imu",))).findings
+    assert found.treatment is Treatment.TRUSTED and str(found).endswith("; trusted") and not moving.mends
+
+
+def test_a_pose_of_their_own_turns_velocities_of_the_room() -> None:
+    truth = [s for s in driven() if s.role is Role.TRUTH]
+
+    def change(value: Any, t: float) -> Any:
+        if not isinstance(value, Twist) or value.linear is None:
+            return value
+        near = truth[min(int(t * 50.0), len(truth) - 1)].value
+        return Twist(near.rotation @ value.linear, None, near)
+
+    streams = streams_of(change)
+    [found] = examine_motion(streams).findings
+    assert "in the frame of its own poses" in found.text and found.treatment is Treatment.MENDED
+    mended = [s.value.linear for s in examine_motion(streams).mended(streams.samples) if s.role is Role.WHEEL]
+    np.testing.assert_allclose(mended, [s.value.linear for s in driven() if s.role is Role.WHEEL], atol=1e-9)
+
+
+def test_a_window_of_live_samples_gives_the_same_line() -> None:
+    streams = streams_of(FAULTS["gyro reversed"][0])
+    monitor, right = StreamMonitor(streams.binding), StreamMonitor(streams.binding)
+    for one, sound in zip(streams.samples, driven(), strict=True):
+        monitor.put(one)
+        right.put(sound)
+    [found] = monitor.findings()
+    assert re.search(FAULTS["gyro reversed"][1], str(found)) and not right.findings()
+
+
+@pytest.mark.parametrize(("factor", "scale"), [(1.0, 0.3), (-2.0, 1.0), (57.3, 0.1)])
+def test_a_relation_has_the_error_that_noise_gives_it(factor: float, scale: float) -> None:
+    """Factors of 200 draws scatter by the standard error that is stated."""
+    rng, t = np.random.default_rng(1), np.arange(0.0, 60.0, 0.1)
+    x = np.sin(t) + 0.3 * np.sin(2.7 * t)
+    found = [relation(t, factor * x + scale * rng.normal(size=len(t)), x) for _ in range(200)]
+    values = np.array([f.factor.real for f in found if f is not None])
+    stated = np.mean([f.error for f in found if f is not None])
+    assert abs(values.mean() - factor) < 4.0 * values.std() / np.sqrt(200)
+    assert 0.7 < stated / values.std() < 1.3
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [(57.312, 0.04, "57.31(4)"), (-1.0, 0.002, "-1.000(2)"), (0.5, 0.0, "0.5"), (12.0, 3.0, "12(3)")],
+)
+def test_a_standard_error_is_in_brackets(value: float, error: float, text: str) -> None:
+    assert with_error(value, error) == text
