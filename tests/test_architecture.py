@@ -110,7 +110,7 @@ CORE_LINES = 48_000
 """Physical lines that the core, without guests, is to have at most; the owner alone raises it."""
 
 
-STILL_ABOVE = 8_859
+STILL_ABOVE = 8_345
 """Lines by which the core exceeds its ceiling: the core grows no further, and this number only falls, to 0."""
 
 
@@ -126,7 +126,7 @@ def test_the_core_grows_no_further() -> None:
 
 
 @pytest.mark.xfail(
-    strict=True, reason="above the ceiling by 2,750 lines before sensors and drives, by 8,850 with noise and guard"
+    strict=True, reason="above the ceiling by 2,750 lines before sensors and drives, by 8,350 with noise and guard"
 )
 def test_the_core_keeps_below_its_ceiling() -> None:
     assert core_lines() <= CORE_LINES
