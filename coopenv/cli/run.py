@@ -241,13 +241,14 @@ def export(
             f"RUN/trajectory.csv or .parquet; {LAYOUT_FILE})."
         ),
     ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing bag.")] = False,
 ) -> None:
     """Write a run or a log in the formats of other programs."""
     if file_format is ExportFormat.layout:
         _export_layout(source, out or Path(LAYOUT_FILE))
         return
     if file_format is ExportFormat.ros2:
-        _export_log(source, out or source.with_suffix(""), file_format.value)
+        _export_log(source, out or source.with_suffix(""), file_format.value, force)
         return
     from coopenv.runs.command import Results
     from coopenv.runs.exports import write_tum
@@ -263,13 +264,13 @@ def export(
     options.console().print(f"Files in {folder}: {', '.join(path.name for path in paths)}", soft_wrap=True)
 
 
-def _export_log(log: Path, out: Path, form: str) -> None:
+def _export_log(log: Path, out: Path, form: str, force: bool) -> None:
     from coopenv.base.files import check_new
     from coopenv.runs.scenes import observer_of
     from coopenv.sources.registry import write_as
     from coopenv.sources.sources import open_recording
 
-    check_new(out, force=False)
+    check_new(out, force)
     recording = open_recording(log)
     write_as(form, recording, out, observer_of(recording))
     options.console().print(f"{out}: {len(recording.setups)} vehicles, {recording.ticks} ticks", soft_wrap=True)

@@ -102,13 +102,16 @@ class Bag(TickGenerator):
         self.log = read_log([Path(path) for path in paths], self.map.model_copy(update={"cars": read}), self.binding)
         self._begin, ticks = self._ticks(start, until)
         scenario = without_robots(self._scenario(changes, ticks), self.kept)
-        if remark := Selection(trust=self.map.trust).remark:
+        self._check_trust()
+        really = dict.fromkeys(f.subject for f in self.log.findings if f.treatment is Treatment.TRUSTED)
+        if remark := Selection(trust=(*really,)).remark:
             scenario = scenario.model_copy(update={"title": scenario.title + remark})
         self.binding = replace(self.binding, scenario=scenario)
         known = any(sample.role is Role.TRUTH for sample in self.log.samples)
         here = self.kept if robots is not None else None
         super().__init__(scenario, Capabilities(known, False, False, ticks, False, True, here))
-        for note in (*self.log.notes, *self._odd_rates(), *self._odd_markers(), *map(str, self.log.findings)):
+        self.notes = (*self.log.notes, *self._odd_rates(), *self._odd_markers())
+        for note in (*self.notes, *map(str, self.log.findings)):
             warnings.warn(f"{self.where}: {note}", DataWarning, stacklevel=2)
 
     def _decisions(self, changes: Mapping[str, Any]) -> dict[str, float]:
@@ -118,6 +121,15 @@ class Bag(TickGenerator):
             return {}
         decision = load_scenario(self.map.environment_path).rates.decision
         return {"rates.decision": rate / math.ceil(rate / decision - 1e-9)}
+
+    def _check_trust(self) -> None:
+        """Raise DataError: something to be trusted is no stream of the bag."""
+        topics = [row.topic for row in self.log.rows if row.role]
+        cars = [name for car in self.binding.cars for name in (car, f"camera of {car}")]
+        known = dict.fromkeys(["all", *topics, "landmarks", "markers", *cars, *(f.subject for f in self.log.findings)])
+        for name in self.map.trust:
+            if ":" not in name:  # of a part of a car or the map
+                check_one_of(f"{self.where}: trust: unknown stream", name, [*known], DataError)
 
     def _kept(self, robots: Sequence[str] | None) -> tuple[int, ...]:
         """Return the vehicles of some cars; None: of all."""

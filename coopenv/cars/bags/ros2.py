@@ -80,6 +80,12 @@ def write_bag(recording: Recording, folder: str | Path, estimates: Run | None = 
     if left_out := sorted({sensor.name for setup in recording.setups for sensor in setup.sensors}):
         text = f"{folder}: left out, since no standard message has their measurements: {listed(left_out)}"
         warnings.warn(text, DataWarning, stacklevel=2)
+    if scenario is not None and (others := {limits.model for limits in scenario.limits} - {"bicycle"}):
+        text = (
+            f"{folder}: written without a map: coopenv reads bags of cars that steer, not of {listed(sorted(others))}"
+        )
+        warnings.warn(text, DataWarning, stacklevel=2)
+        scenario = None
     names = (METADATA, f"{folder.name}.mcap", MAP_FILE, ENVIRONMENT_FILE)
     with replacing_folder(folder, names) as part, writing(folder):
         with Writer(part / folder.name, version=9, storage_plugin=StoragePlugin.MCAP) as bag:

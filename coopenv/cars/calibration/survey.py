@@ -254,6 +254,9 @@ def survey(bags: Sequence[Path], like: str, folder: Path, truth: bool = True) ->
             notes[number] = f"left out: known to {100.0 * std:.0f} cm; drive nearer, or past it"
     known = {n: (tuple(places[k].round(4).tolist()), tuple(error[k].tolist())) for k, n in enumerate(standing)}
     solution = {number: entry for number, entry in known.items() if number not in notes}
+    if not has_truth:  # its frame is another one
+        truths = {Role.TRUTH}
+        room = replace(room, cars={car: {r: of[r] for r in of.keys() - truths} for car, of in cars.items()})
     _check_some(title, solution, notes)
     marks = {names[number]: number for number in solution}
     room.write(starts, {name: solution[number][0] for name, number in marks.items()}, marks, own)
@@ -266,7 +269,8 @@ def survey(bags: Sequence[Path], like: str, folder: Path, truth: bool = True) ->
 def _check_some(title: str, found: Collection[int], notes: Mapping[int, str]) -> None:
     """Raise DataError, which says why, if there is no marker."""
     if not found:
-        raise DataError(f"{title}: {'; '.join(f'marker {number}: {why}' for number, why in notes.items())}")
+        why = "; ".join(f"marker {number}: {text}" for number, text in notes.items())
+        raise DataError(f"{title}: {why}. Are camera and mounting those of --like, and turn rates right?")
 
 
 def only(drive: CalibrationDrive, kept: Sequence[int]) -> CalibrationDrive:

@@ -146,13 +146,13 @@ def doctor(
         bag = open_bags(bags, options.parse_overrides(overrides), topics, Selection(trust=tuple(trust or ())))
     findings, console = bag.log.findings, options.console()
     if as_json:
-        options.print_json({"findings": [*findings], "notes": [*bag.log.notes]})
+        options.print_json({"findings": [*findings], "notes": [*bag.notes]})
     else:
         table = Table.of_texts(["stream", "contradiction", "mended by", "treatment"], [])
         for finding in findings:
             table.add(finding.subject, finding.text, finding.key, finding.treatment.value)
         console.print(table if findings else "No stream contradicts another.", soft_wrap=not findings)
-        for note in bag.log.notes:
+        for note in bag.notes:
             console.print(note, soft_wrap=True)
         read = [row for row in bag.log.rows if row.role]
         console.print(f"{bag.where}: {len(bag.binding.cars)} cars, {len(read)} topics", soft_wrap=True)

@@ -108,7 +108,7 @@ def _height(streams: Streams, car: CarStreams) -> float:
 def _mend_of(finding: Finding, car: CarStreams) -> Mend:
     """Return the change of samples that removes a finding that can be mended, or leaves out what repeats itself."""
     key, _, value = finding.key.partition(" = ")
-    factor, last = float(value or 1.0), [np.zeros(3)]
+    factor, last = float(value or 1.0), [np.full(3, np.nan)]
 
     def mend(sample: Sample) -> Sample | None:
         twist = sample.value

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from enum import Enum
-from math import ceil, floor, log10
+from math import ceil, floor, inf, log10
 
 
 class Treatment(Enum):
@@ -44,7 +44,7 @@ class Finding:
 
 def with_error(value: float, error: float) -> str:
     """Return a value with its standard error in brackets, in units of the last digit: 57.31(4)."""
-    if not error > 0.0:
+    if not 0.0 < error < inf:
         return f"{value:.4g}"
     digits = max(0, -floor(log10(error)))
     digits = max(0, digits - (ceil(error * 10**digits) > 9))

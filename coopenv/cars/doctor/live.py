@@ -13,7 +13,7 @@ from coopenv.cars.doctor.streams import Streams
 from coopenv.cars.doctor.turning import turn_contradiction
 from coopenv.cars.messages.readings import Sample, Twist
 
-KEPT = 3_000  # samples of a car, some 10 s
+KEPT = 6_000  # samples of a car, some 20 s
 MOVED = 0.3  # m
 LASTS = 1_000_000_000  # ns for which a result holds
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -169,10 +170,12 @@ def velocity_relations(
     time, velocity = car.tracks["wheel_time"], car.tracks["wheel"]
     if len(time) < 2:
         return None, None
-    measured = SampledSignal(
-        time,
-        np.column_stack([SampledSignal.of_rates(time, part).values[:, 0] for part in (velocity.real, velocity.imag)]),
-    )
+
+    def way(velocity: NDArray[np.complex128]) -> SampledSignal:
+        parts = (SampledSignal.of_rates(time, part).values[:, 0] for part in (velocity.real, velocity.imag))
+        return SampledSignal(time, np.column_stack([*parts]))
+
+    measured = way(velocity)
     begin, end = intervals(measured, place, heading)
     middle, turn = heading.over(begin, 0.5 * (begin + end), level=True)[:, 0], heading.over(begin, end)[:, 0]
     true = _planar(place.over(begin, end))
@@ -181,11 +184,17 @@ def velocity_relations(
         return None, None
     body = true * np.exp(-1j * middle)
 
+    def driven(lag: float) -> NDArray[np.complex128]:
+        """Return the chords (n,) of the measured arcs, about the heading in their middle."""
+        yaw = np.interp(time - lag, heading.times, heading.values[:, 0])
+        arc = way(velocity * np.exp(1j * yaw)).over(begin + lag, end + lag)
+        return np.asarray(_planar(arc) * np.exp(-1j * middle))
+
     def moved(lag: float) -> NDArray[np.complex128]:
         return _planar(measured.over(begin + lag, end + lag))
 
     return (
-        at_best(lambda lag: relation(begin, moved(lag), body, 1j * turn)),
+        at_best(lambda lag: relation(begin, driven(lag), body, 2j * np.sin(0.5 * turn))),
         at_best(lambda lag: relation(begin, moved(lag), true)),
     )
 
@@ -249,10 +258,13 @@ def _velocity(car: CarStreams, topic: str, what: str, body: Relation) -> Finding
     """Return the finding of a wrong sign, unit, scale or direction of velocities."""
     size, angle = abs(body.factor), math.degrees(float(np.angle(body.factor)))
     signed = size if abs(angle) < 90.0 else -size
-    if abs(math.sin(math.radians(angle))) > 0.3:
-        shown = with_error(angle, math.degrees(body.error / size))
-        text = f"the velocity of {car.name} points {shown} deg to the left of the motion by {what}: other axes"
-        return Finding(topic, text, angle, math.degrees(body.error / size), "", Treatment.REFUSED, car.name)
+    crooked = abs(math.sin(math.radians(angle))) > 0.3
+    if crooked or (signed > 0.0 and abs(body.factor.imag) > abs(size - 1.0)):
+        shown, treatment = with_error(angle, math.degrees(body.error / size)), Treatment.REFUSED
+        text = f"the velocity of {car.name} points {shown} deg to the left of the motion by {what}"
+        if not crooked:
+            return Finding(topic, text, angle, math.degrees(body.error / size), car=car.name)
+        return Finding(topic, f"{text}: other axes", angle, math.degrees(body.error / size), "", treatment, car.name)
     known = named(signed, SPEED_FACTORS)
     exact = signed if known is None else known[1]
     text = f"the velocity of {car.name} is {with_error(signed, body.error)} times that of {what}"
@@ -271,43 +283,56 @@ STUCK = 0.15
 
 def of_frozen_streams(car: CarStreams) -> Iterator[Finding]:
     """Yield streams that repeat a value while another one shows that the car moves."""
-    wheel_time, wheel, gyro_time, gyro = (car.tracks[name] for name in ("wheel_time", "wheel", "gyro_time", "gyro"))
-    truth_time, place, yaw = (car.tracks[name] for name in ("truth_time", "truth", "truth_yaw"))
-    if len(truth_time) < 3 or len(wheel_time) < 2:
+    tracks = car.tracks
+    if len(tracks["truth_time"]) < 3 or len(tracks["wheel_time"]) < 2:
         return
-    begin, end, _ = frozen(wheel_time, wheel)
-    inside = (truth_time >= begin) & (truth_time <= end)
-    if end - begin > FROZEN and inside.sum() > 2:
-        speed = float(abs(wheel[wheel_time == begin][0]))
-        way, claimed = float(np.abs(np.diff(place[inside][::5])).sum()), speed * (end - begin)
-        if (
-            abs(way - claimed) > max(STUCK, 0.1 * way)
-            and max(claimed, float(np.ptp(np.abs(place[inside] - place[inside][0])))) > STUCK
-        ):
+    for found in (_frozen_velocity, _frozen_turning, _frozen_truth):
+        yield from islice(found(car), 1)
+
+
+def _frozen_velocity(car: CarStreams) -> Iterator[Finding]:
+    truth_time, place, wheel = (car.tracks[name] for name in ("truth_time", "truth", "wheel"))
+    for begin, end, first in frozen(car.tracks["wheel_time"], wheel):
+        inside = (truth_time >= begin) & (truth_time <= end)
+        if inside.sum() < 3:
+            continue
+        speed, there = float(abs(wheel[first])), place[inside]
+        way, claimed = float(np.abs(np.diff(there[::5])).sum()), speed * (end - begin)
+        far = max(claimed, float(np.ptp(np.abs(there - there[0]))))
+        if abs(way - claimed) > max(STUCK, 0.1 * way) and far > STUCK:
             text = f"the velocity of {car.name} is {speed:.3g} m/s in a row for {end - begin:.1f} s, in which "
             text += f"motion capture moves it by {way:.2f} m"
             yield Finding(car.topic(MOVING), text, way - claimed, None, "", Treatment.REFUSED, car.name)
-    if len(gyro_time) > 1:
-        begin, end, _ = frozen(gyro_time, gyro)
+
+
+def _frozen_turning(car: CarStreams) -> Iterator[Finding]:
+    truth_time, yaw, gyro = (car.tracks[name] for name in ("truth_time", "truth_yaw", "gyro"))
+    for begin, end, first in frozen(car.tracks["gyro_time"], gyro):
         inside = (truth_time >= begin) & (truth_time <= end)
-        if end - begin > FROZEN and inside.sum() > 2:
-            rate = float(gyro[gyro_time == begin][0]) + 0.0  # no negative zero
-            turned = float(np.ptp(np.unwrap(yaw[inside]) - rate * truth_time[inside]))
-            if turned > TURNED:
-                text = f"the turn rate of {car.name} is {rate:.3g} rad/s in a row for {end - begin:.1f} s, in which "
-                text += f"motion capture turns it by {math.degrees(turned):.0f} deg"
-                yield Finding(car.topic(TURNING), text, turned, None, "", Treatment.REFUSED, car.name)
-    begin, end, _ = frozen(truth_time, place + 1e3 * yaw)
-    moving = (wheel_time >= begin) & (wheel_time <= end)
-    way = float(np.abs(wheel[moving]).mean() * (end - begin)) if moving.any() else 0.0
-    if end - begin > FROZEN and way > 2.0 * STUCK:
-        text = f"motion capture repeats one pose of {car.name} for {end - begin:.1f} s, in which its wheels move it by "
-        yield Finding(car.topic([Role.TRUTH]), f"{text}{way:.2f} m", way, None, "", Treatment.LEFT_OUT, car.name)
+        if inside.sum() < 3:
+            continue
+        rate = float(gyro[first]) + 0.0  # no negative zero
+        turned = float(np.ptp(np.unwrap(yaw[inside]) - rate * truth_time[inside]))
+        if turned > TURNED:
+            text = f"the turn rate of {car.name} is {rate:.3g} rad/s in a row for {end - begin:.1f} s, in which "
+            text += f"motion capture turns it by {math.degrees(turned):.0f} deg"
+            yield Finding(car.topic(TURNING), text, turned, None, "", Treatment.REFUSED, car.name)
 
 
-def frozen(time: Array, values: NDArray[Any]) -> tuple[float, float, int]:
-    """Return begin and end, s, of the longest run of equal values (n,), n > 0, and the number of its messages."""
-    ends = np.flatnonzero(np.append(np.diff(values) != 0.0, True))
-    begins = np.append(0, ends[:-1] + 1)
-    best = int(np.argmax(ends - begins))
-    return float(time[begins[best]]), float(time[ends[best]]), int(ends[best] - begins[best]) + 1
+def _frozen_truth(car: CarStreams) -> Iterator[Finding]:
+    wheel_time, wheel = car.tracks["wheel_time"], car.tracks["wheel"]
+    for begin, end, _ in frozen(car.tracks["truth_time"], car.tracks["truth"] + 1e3 * car.tracks["truth_yaw"]):
+        moving = (wheel_time >= begin) & (wheel_time <= end)
+        way = float(np.abs(wheel[moving]).mean() * (end - begin)) if moving.any() else 0.0
+        if way > 2.0 * STUCK:
+            text = f"motion capture repeats one pose of {car.name} for {end - begin:.1f} s, in which "
+            text += f"its wheels move it by {way:.2f} m"
+            yield Finding(car.topic([Role.TRUTH]), text, way, None, "", Treatment.LEFT_OUT, car.name)
+
+
+def frozen(time: Array, values: NDArray[Any]) -> Iterator[tuple[float, float, int]]:
+    """Yield begin, end, s, and first place of the runs of equal values (n,) that last longer than `FROZEN`."""
+    ends = np.flatnonzero(np.append(np.diff(values) != 0.0, True)) if len(values) else np.zeros(0, np.int64)
+    for first, last in zip(np.append(0, ends[:-1] + 1).tolist(), ends.tolist(), strict=False):
+        if time[last] - time[first] > FROZEN:
+            yield float(time[first]), float(time[last]), first

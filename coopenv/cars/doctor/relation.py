@@ -45,7 +45,7 @@ def intervals(*signals: SampledSignal) -> tuple[Array, Array]:
 
 
 def relation(time: Array, y: Numbers, x: Numbers, *others: Numbers) -> Relation | None:
-    """Return the factor of x in y, both (n,); None: too few, or no changes of x.
+    """Return the factor of x in y, both (n,); None: too few, too short a time, or no changes of x.
 
     Beside it, other changes (n,) have real factors, and real ones a constant. Outliers do not count: residuals beyond
     three times their 90 % quantile.
@@ -53,6 +53,8 @@ def relation(time: Array, y: Numbers, x: Numbers, *others: Numbers) -> Relation 
     planar = np.iscomplexobj(y)
     terms = [x, 1j * x, *others] if planar else [x, np.ones(len(x)), *others]
     there = np.isfinite(y) & np.isfinite(np.stack(terms)).all(axis=0)
+    if len(time) and time[-1] - time[0] < 2.0 * len(terms) * BLOCK:  # two blocks for each factor and its error
+        return None
     if there.sum() < FEWEST or np.ptp(x[there].real) == 0.0 == np.ptp(x[there].imag):
         return None
     time, y, columns = time[there], y[there], np.stack(terms, axis=-1)[there]

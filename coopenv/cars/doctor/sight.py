@@ -25,6 +25,7 @@ from coopenv.estimation.poses import Array
 FEWEST, MOST = 12, 400  # sightings
 BAD = 0.004
 """Mean misfit, of angles of 3.6 deg, above which a coarse cause is looked for; smaller ones are calibration's."""
+OFF_DEG = 3.6
 REMOVED = 0.35
 """Share of the misfit that the cause leaves at most."""
 
@@ -48,11 +49,15 @@ class PosedSightings:
         flat = np.exp(-1j * self.yaw) * (self.point[:, 0] + 1j * self.point[:, 1] - self.place)
         return np.stack([flat.real, flat.imag, self.point[:, 2] - self.height], axis=-1) - self.lever
 
-    def median_deg(self) -> float:
-        """Return the median angle between rays and markers, deg."""
+    def off_deg(self) -> Array:
+        """Return the angles (m,) between rays and markers, deg."""
         ahead = self.ahead()
         cosine = ((self.ray @ self.mounting.T) * ahead).sum(axis=-1) / np.linalg.norm(ahead, axis=-1)
-        return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))
+        return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+    def off_share(self) -> float:
+        """Return the share of the rays that are off by more than `OFF_DEG`."""
+        return float((self.off_deg() > OFF_DEG).mean())
 
     def misfit(self) -> float:
         """Return the mean of (2 sin(angle / 2))^2 up to 0.04 between rays and markers."""
@@ -62,7 +67,7 @@ class PosedSightings:
 def sight_of(streams: Streams, car: CarStreams, height: float) -> PosedSightings | None:
     """Return the sightings of a car with its poses by motion capture; None: too few, or the map has a single place."""
     truth = truth_signals(car)
-    if not np.ptp(streams.places, axis=0).any() or truth is None or len(car.time) < FEWEST:
+    if len(streams.places) < 2 or not np.ptp(streams.places, axis=0).any() or truth is None or len(car.time) < FEWEST:
         return None
     rows = np.arange(len(car.time))[:: max(1, len(car.time) // MOST)]
     pose = np.column_stack([signal.over(car.time[rows], car.time[rows], level=True) for signal in truth])
@@ -98,7 +103,9 @@ def causes(sight: PosedSightings, car: CarStreams, names: list[str], numbers: di
     """Yield the possible causes; `names` of the landmarks, `numbers` of the markers by landmark."""
     for i, j in combinations(sorted(set(sight.target.tolist())), 2):
         swapped = np.where(sight.target == i, j, np.where(sight.target == j, i, sight.target))
-        key = f"markers = {{ {names[i]} = {numbers.get(j)}, {names[j]} = {numbers.get(i)} }}"
+        right = {i: numbers.get(j), j: numbers.get(i)}
+        entries = (f"{names[k]} = {right.get(k, number)}" for k, number in sorted(numbers.items()))
+        key = f"markers = {{ {', '.join(entries)} }}"
         text = f"markers {names[i]} and {names[j]} are exchanged"
         yield Cause("markers", text, replace(sight, point=sight.places[swapped]), key=key)
     yield from _of_map(sight)
@@ -218,12 +225,12 @@ def of_sight(sight: PosedSightings, car: CarStreams, names: list[str], numbers: 
     explained = bool(found)
     ask = " (are heading, unit and frames.truth right?)"
     for cause in found or [Cause(topic, "no single cause explains it", sight)]:
-        rest = found[-1].changed.median_deg() if found else 0.0
-        off = f"bearings are {sight.median_deg():.0f} deg off (median), and {rest:.2g} deg without it"
+        rest = f", and {found[-1].changed.off_share():.0%} with that mended" if found else ""
+        off = f"{sight.off_share():.0%} of the bearings are off by more than {OFF_DEG} deg{rest}"
         text, treatment = f"{cause.text}: {off}", Treatment.REFUSED
         if cause.subject == topic:
-            off = f"{sight.median_deg():.0f} deg off the bearings to landmarks (median)"
-            text = f"motion capture of {car.name}, topic {topic}, is {_far(sight) or off}: {cause.text}{ask}"
+            off = f"{np.median(sight.off_deg()):.0f} deg off the bearings to landmarks (median)"
+            text = f"motion capture of {car.name} is {_far(sight) or off}: {cause.text}{ask}"
             treatment = Treatment.USED
         yield Finding(cause.subject, text, cause.size, cause.error, cause.key, treatment, car.name, explained)
 

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from coopenv.cars.backend.binding import Binding, bind
+from coopenv.cars.bags.clocks import SampledSignal
 from coopenv.cars.doctor.doctor import examine_map, examine_motion
 from coopenv.cars.doctor.finding import Treatment, with_error
 from coopenv.cars.doctor.live import StreamMonitor
+from coopenv.cars.doctor.motion import of_frozen_streams, velocity_relations
 from coopenv.cars.doctor.relation import relation
+from coopenv.cars.doctor.sight import sight_of
 from coopenv.cars.doctor.streams import Streams
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist
 from coopenv.cars.messages.vision import Calibration
@@ -282,3 +286,52 @@ def test_a_relation_has_the_error_that_noise_gives_it(factor: float, scale: floa
 )
 def test_a_standard_error_is_in_brackets(value: float, error: float, text: str) -> None:
     assert with_error(value, error) == text
+
+
+def cut(samples: Sequence[Sample], begin: float, seconds: float) -> list[Sample]:
+    """Return the samples of a part of a drive."""
+    return [s for s in samples if S * (1.0 + begin) <= s.stamp < S * (1.0 + begin + seconds)]
+
+
+@pytest.mark.parametrize("seconds", [4.0, 6.0, 9.0, 13.0])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_short_sound_drive_is_silent(seconds: float, seed: int) -> None:
+    for begin in (0.0, 5.0, 10.0):
+        whole = streams_of(None)
+        assert not examine_motion(replace(whole, samples=cut(driven(seed), begin, seconds))).findings
+
+
+def test_the_scale_of_wheels_is_that_of_the_arc_in_tight_turns() -> None:
+    """A chord is shorter than its arc: by 1/24 of the square of the turn within a second."""
+    t = np.arange(0.0, 40.0, 0.02)
+    rate = 1.2 + 0.5 * np.sin(0.7 * t)
+    speed = 0.6 + 0.2 * np.sin(0.9 * t)
+    yaw = np.cumsum(rate) * 0.02
+    place = np.cumsum(speed * np.exp(1j * (yaw - 0.5 * rate * 0.02))) * 0.02
+    noise = np.random.default_rng(0).normal(size=len(t))
+    tracks = {"wheel_time": t, "wheel": 1.2 * speed + 0.01 * noise + 0j}
+    car: Any = SimpleNamespace(tracks=tracks)
+    path = SampledSignal(t, np.column_stack([place.real, place.imag])), SampledSignal(t, yaw)
+    body, _ = velocity_relations(car, *path)
+    assert body is not None and abs(body.factor - 1.2) < max(0.002, 3.0 * body.error)
+
+
+def test_a_velocity_that_sticks_after_a_stand_is_found() -> None:
+    t = np.arange(0.0, 40.0, 0.02)
+    place = 0.3 * np.maximum(t - 20.0, 0.0) + 0j
+    wheel = np.where(t < 20.0, 0.0, 0.3) + np.where(t < 20.0, 0.0, 0.01) * np.random.default_rng(0).normal(size=len(t))
+    wheel[(t > 28.0) & (t < 36.0)] = 0.0
+    tracks = {"truth_time": t, "truth": place, "truth_yaw": 0.0 * t, "wheel_time": t, "wheel": wheel + 0j}
+    car: Any = SimpleNamespace(name="car", tracks=tracks | {"gyro_time": t, "gyro": t}, topic=lambda roles: "/wheels")
+    [found] = [f for f in of_frozen_streams(car) if "velocity" in f.text]
+    assert "in a row for 8.0 s" in found.text and "2.37 m" in found.text
+
+
+def test_a_map_without_standing_landmarks_is_compared_with_nothing() -> None:
+    streams = streams_of(None)
+    blind: Any = SimpleNamespace(places=np.zeros((0, 3)), binding=streams.binding)
+    assert sight_of(blind, streams.car("car"), 0.0) is None
+
+
+def test_an_error_that_is_not_known_has_no_brackets() -> None:
+    assert with_error(1.5, np.inf) == "1.5"

@@ -140,3 +140,10 @@ def test_trust_is_for_bags() -> None:
 def test_the_page_lists_the_checks_of_the_code() -> None:
     page = Path(__file__).resolve().parents[3] / "docs" / "bags.md"
     assert listed_checks() in page.read_text(encoding="utf-8")
+
+
+def test_only_streams_can_be_trusted(drive: Recording, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="trust: unknown stream '/imv'"):
+        opened(tmp_path, bags.messages(drive), trust=("/imv",))
+    bag = opened(tmp_path, [], trust=("markers", TWIST))
+    assert "trusted" not in bag.scenario.title
