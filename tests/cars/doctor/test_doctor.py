@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
@@ -335,3 +336,19 @@ def test_a_map_without_standing_landmarks_is_compared_with_nothing() -> None:
 
 def test_an_error_that_is_not_known_has_no_brackets() -> None:
     assert with_error(1.5, np.inf) == "1.5"
+
+
+def test_exchanged_markers_are_mended_by_the_whole_table() -> None:
+    found = [f for f in findings_of(streams_of(FAULTS["markers exchanged"][0])) if f.subject == "markers"]
+    assert tomllib.loads(found[0].key)["markers"] == {"SL1": 4, "SL2": 2, "SL4": 3, "SL5": 1, "ML": 5}
+    assert "0% with that mended" in found[0].text
+
+
+def test_a_velocity_that_points_aside_has_no_scale_as_its_key() -> None:
+    def change(value: Any, _: float) -> Any:
+        if not isinstance(value, Twist) or value.linear is None:
+            return value
+        return Twist(turn(np.radians(12.0)) @ value.linear, value.angular)
+
+    [found] = [f for f in examine_motion(streams_of(change)).findings if "velocity" in f.text]
+    assert re.search(r"points 1[12]\.\d*\(\d+\) deg to the left", found.text) and not found.key
