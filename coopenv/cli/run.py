@@ -230,8 +230,7 @@ def export(
         typer.Option(
             "--format",
             help="tum: true and estimated trajectories of a run, which evo reads. csv, parquet: its table, a row per "
-            "tick and vehicle. foxglove-layout: how Foxglove and Lichtblick arrange a log. ros2: a log as a plain "
-            "ROS 2 bag.",
+            "tick and vehicle. foxglove-layout: how Foxglove arranges a log. ros2: a log as a plain ROS 2 bag.",
         ),
     ] = ExportFormat.tum,
     out: Annotated[

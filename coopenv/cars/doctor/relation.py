@@ -23,6 +23,10 @@ SIGNIFICANT = 6.0
 tails of Student's t with 9 degrees of freedom, as of ten blocks (20 s)."""
 
 
+GROSS = 0.5
+"""Relative size of a wrong sign or unit, which a short drive shows: the least of them, 1 / 3.6, differs by 0.72."""
+
+
 class Relation(NamedTuple):
     """y = factor x + offsets, of real or planar (complex) changes."""
 
@@ -30,10 +34,13 @@ class Relation(NamedTuple):
     error: float
     explained: float
     """Share of the variance of y."""
+    short: bool = False
+    """Whether there are fewer than two blocks for each factor, whose errors are not known."""
 
     def differs(self, practical: float) -> bool:
         """Return whether the factor is not 1: by more than a practical size, and than its error allows."""
-        return abs(self.factor - 1.0) > max(practical, SIGNIFICANT * self.error)
+        least = max(practical, GROSS) if self.short else practical
+        return abs(self.factor - 1.0) > max(least, SIGNIFICANT * self.error)
 
 
 def intervals(*signals: SampledSignal) -> tuple[Array, Array]:
@@ -45,7 +52,7 @@ def intervals(*signals: SampledSignal) -> tuple[Array, Array]:
 
 
 def relation(time: Array, y: Numbers, x: Numbers, *others: Numbers) -> Relation | None:
-    """Return the factor of x in y, both (n,); None: too few, too short a time, or no changes of x.
+    """Return the factor of x in y, both (n,); None: too few, or no changes of x.
 
     Beside it, other changes (n,) have real factors, and real ones a constant. Outliers do not count: residuals beyond
     three times their 90 % quantile.
@@ -53,8 +60,6 @@ def relation(time: Array, y: Numbers, x: Numbers, *others: Numbers) -> Relation 
     planar = np.iscomplexobj(y)
     terms = [x, 1j * x, *others] if planar else [x, np.ones(len(x)), *others]
     there = np.isfinite(y) & np.isfinite(np.stack(terms)).all(axis=0)
-    if len(time) and time[-1] - time[0] < 2.0 * len(terms) * BLOCK:  # two blocks for each factor and its error
-        return None
     if there.sum() < FEWEST or np.ptp(x[there].real) == 0.0 == np.ptp(x[there].imag):
         return None
     time, y, columns = time[there], y[there], np.stack(terms, axis=-1)[there]
@@ -73,4 +78,5 @@ def relation(time: Array, y: Numbers, x: Numbers, *others: Numbers) -> Relation 
     scores = np.stack([np.bincount(block, column * rest[kept]) for column in columns[kept].T], axis=-1)
     deviations = np.sqrt(np.maximum((inverse @ scores.T @ scores @ inverse).diagonal(), 0.0))
     factor = complex(*solution[:2]) if planar else complex(solution[0])
-    return Relation(factor, float(deviations[: 1 + planar].max()), 1.0 - left)
+    short = bool(time[-1] - time[0] < 2.0 * len(terms) * BLOCK)
+    return Relation(factor, float(deviations[: 1 + planar].max()), 1.0 - left, short)

@@ -230,7 +230,7 @@ def of_sight(sight: PosedSightings, car: CarStreams, names: list[str], numbers: 
         text, treatment = f"{cause.text}: {off}", Treatment.REFUSED
         if cause.subject == topic:
             off = f"{np.median(sight.off_deg()):.0f} deg off the bearings to landmarks (median)"
-            text = f"motion capture of {car.name} is {_far(sight) or off}: {cause.text}{ask}"
+            text = f"motion capture of {car.name}, topic {topic}, is {_far(sight) or off}: {cause.text}{ask}"
             treatment = Treatment.USED
         yield Finding(cause.subject, text, cause.size, cause.error, cause.key, treatment, car.name, explained)
 
