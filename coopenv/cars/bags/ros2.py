@@ -194,7 +194,7 @@ class _Vehicle:
             yield "estimate", self._estimate(k, self._estimates)
 
     def _marker(self, k: int, target: int, about: Any) -> Any:
-        """Return the message of a bearing, at a distance that says nothing."""
+        """Return the message of a bearing, at `DISTANCE`, which a camera does not measure."""
         ray = self._to_body.T @ self._recording.bearings[k, self._number, target]
         place = {"pose": {"position": tuple(DISTANCE * ray), "orientation": (0.0, 0.0, 0.0, 1.0)}}
         return make("aruco_msgs/msg/Marker", header=about, id=FIRST_MARKER + target, pose=place)

@@ -26,8 +26,8 @@ from coopenv.cars.calibration.calibrate import errors
 from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive, drive_of_streams
 from coopenv.cars.settings.profile import Role
 from coopenv.cars.settings.toml import toml_text
-from coopenv.estimation.poses import Array
-from coopenv.scenario import load_scenario
+from coopenv.estimation.poses import Array, about_z
+from coopenv.scenario import Scenario, load_scenario
 
 LEAST_FRAMES = 50  # in which a marker must be seen
 FITTING, MEETING = 0.8, 0.03  # share of the lines of sight that pass a marker that stands within an angle, rad
@@ -100,23 +100,20 @@ def angles(ray: Array, line: Array) -> Array:
 
 def lines_of_sight(car: CarDrive, place: Array, yaw: Array) -> tuple[Array, Array]:
     """Return the cameras (n, 3), m, and unit rays (n, 3) of a car's sightings, map, by its places (complex) and yaw."""
-    R = np.zeros((len(yaw), 3, 3))
-    R[:, 0, 0] = R[:, 1, 1] = np.cos(yaw)
-    R[:, 1, 0], R[:, 0, 1], R[:, 2, 2] = np.sin(yaw), -np.sin(yaw), 1.0
+    R = about_z(yaw)
     at = np.stack([place.real, place.imag, np.full(len(yaw), car.height)], axis=-1)
     return at + R @ car.lever, (R @ (car.ray @ car.mounting.T)[:, :, None])[..., 0]
 
 
-def first_poses(batch: Batch) -> tuple[list[Array], list[int], Array]:
-    """Return first poses (M, 3) of all cars at keyframes, the cars whose poses are known, and first constants (G,).
+def first_constants(batch: Batch) -> Array:
+    """Return the constants (G,) by which the lines of sight of known cars meet best, zero but for one of each car.
 
-    With motion capture it is the time of a car's sightings by which its lines of sight meet best. Without it, the first
-    car is known by dead reckoning from the origin, with the gyro bias by which they do; others are not known.
+    With motion capture it is the time of a car's sightings, and without it the gyro bias of the first car.
     """
     x = np.zeros(len(batch.kinds))
-    known = [c for c, has in enumerate(batch.truth) if has]
-    for c in known or [0]:
-        constant, tried = (batch.own(c).start + CAMERA_TIME, LATE) if known else (batch.own(c).start + BIAS, BIASES)
+    for c in known_cars(batch):
+        tried, place = (LATE, CAMERA_TIME) if any(batch.truth) else (BIASES, BIAS)
+        constant = batch.own(c).start + place
 
         def missed(value: float, c: int = c, constant: int = constant) -> float:
             x[constant] = value
@@ -129,7 +126,12 @@ def first_poses(batch: Batch) -> tuple[list[Array], list[int], Array]:
         best = best if missed(best) < MUCH_BETTER * missed(0.0) else 0.0
         bounds = best - step, best + step
         x[constant] = minimize_scalar(missed, bounds=bounds, method="bounded", options={"xatol": 0.02 * step}).x
-    return [keyframe_poses(batch, c, x) for c in range(len(batch.cars))], known or [0], x
+    return x
+
+
+def known_cars(batch: Batch) -> list[int]:
+    """Return the cars with motion capture; without any the first one, which is known by dead reckoning."""
+    return [c for c, has in enumerate(batch.truth) if has] or [0]
 
 
 def keyframe_poses(batch: Batch, c: int, x: Array) -> Array:
@@ -143,16 +145,22 @@ def keyframe_poses(batch: Batch, c: int, x: Array) -> Array:
     return np.stack([place.real, place.imag, yaw], axis=-1)
 
 
-def solved(drive: CalibrationDrive, truth: bool) -> tuple[Batch, Fit, Array, Array]:
+def solved(drive: CalibrationDrive, truth: bool, begun: Array) -> tuple[Batch, Fit, Array, Array]:
     """Return the batch of a drive, its fit with all markers free, places (L, 3) of markers and starts (C, 3) of cars.
 
-    The first car's sightings give the first places; without motion capture other cars are found by these.
+    The sightings of known cars give the first places, and these the first poses of other cars.
+
+    Args:
+        drive: its cars and markers.
+        truth: whether motion capture counts.
+        begun: the first constants of its cars, as of `first_constants`; those of markers are not read.
     """
-    batch = Batch(drive, truth)
-    poses, counted, x = first_poses(batch)
+    batch = Batch(replace(drive, places=drive.places.copy()), truth)
+    x, counted = np.zeros(len(batch.kinds)), known_cars(batch)
+    x[: batch.markers] = begun[: batch.markers]
+    poses = [keyframe_poses(batch, c, x) for c in range(len(batch.cars))]
     for i in range(len(batch.places)):
-        found = [_seen(batch, c, x, poses[c], i) for c in counted]
-        origin, ray = (np.concatenate(part) for part in zip(*found, strict=True))
+        origin, ray = _seen_by(batch, counted, x, poses, i)
         if len(ray):
             batch.places[i] = meeting_point(origin, ray)[0]
     batch.base[batch.markers : batch.frame] = batch.places.ravel()
@@ -186,6 +194,13 @@ def _seen(batch: Batch, c: int, x: Array, pose: Array, target: int) -> tuple[Arr
     place = np.interp(time, keys, pose[:, 0] + 1j * pose[:, 1])
     cut = replace(car, ray=car.ray[of], time=time, target=car.target[of])
     return lines_of_sight(cut, place, np.interp(time, keys, pose[:, 2]))
+
+
+def _seen_by(batch: Batch, cars: Sequence[int], x: Array, poses: Sequence[Array], target: int) -> tuple[Array, Array]:
+    """Return the lines of sight of some cars to a target, see `_seen`."""
+    found = [_seen(batch, c, x, poses[c], target) for c in cars]
+    origin, ray = (np.concatenate(part) for part in zip(*found, strict=True))
+    return origin, ray
 
 
 @dataclass(frozen=True)
@@ -239,13 +254,14 @@ def survey(bags: Sequence[Path], like: str, folder: Path, truth: bool = True) ->
     apart[:, 0] = 10.0 * np.arange(len(cars))
     unnamed = {f"M{number}": number for number in numbers}
     with TemporaryDirectory() as scratch:  # an environment in which every marker has some place, to read the bags
-        begun = replace(room, folder=Path(scratch))
-        begun.write(apart, dict.fromkeys(unnamed, (0.0, 0.0, 0.0)), unnamed, {})
-        bag = open_bags(bags, {}, begun.files[1])
+        unsolved = replace(room, folder=Path(scratch))
+        unsolved.write(apart, dict.fromkeys(unnamed, (0.0, 0.0, 0.0)), unnamed, {})
+        bag = open_bags(bags, {}, unsolved.files[1])
         drive = drive_of_streams(bag.streams, bag.where)
-    own, standing, notes = sorted_markers(drive, truth, numbers)
+    begun = first_constants(batch := Batch(drive, truth))
+    own, standing, notes = sorted_markers(batch, begun, numbers)
     _check_some(title, standing, notes)
-    batch, fit, places, starts = solved(only(drive, [numbers.index(n) for n in standing]), truth)
+    batch, fit, places, starts = solved(only(drive, [numbers.index(n) for n in standing]), truth, begun)
     error, has_truth = place_errors(batch, fit), any(batch.truth)
     names = {number: f"M{number}" for number in standing} | {number: car for car, number in own.items()}
     names |= same_names(template, standing, places) if has_truth else {}
@@ -267,7 +283,7 @@ def survey(bags: Sequence[Path], like: str, folder: Path, truth: bool = True) ->
 
 
 def _check_some(title: str, found: Collection[int], notes: Mapping[int, str]) -> None:
-    """Raise DataError, which says why, if there is no marker."""
+    """Raise DataError, with the reasons, if there is no marker."""
     if not found:
         why = "; ".join(f"marker {number}: {text}" for number, text in notes.items())
         raise DataError(f"{title}: {why}. Are camera and mounting those of --like, and turn rates right?")
@@ -290,17 +306,19 @@ def only(drive: CalibrationDrive, kept: Sequence[int]) -> CalibrationDrive:
     )
 
 
-def sorted_markers(
-    drive: CalibrationDrive, truth: bool, numbers: Sequence[int]
-) -> tuple[dict[str, int], list[int], dict[int, str]]:
-    """Return the markers that cars carry, by car, those that stand still, and why others are left out."""
-    batch = Batch(drive, truth)
-    poses, counted, x = first_poses(batch)
+def sorted_markers(batch: Batch, x: Array, numbers: Sequence[int]) -> tuple[dict[str, int], list[int], dict[int, str]]:
+    """Return the markers that cars carry, by car, those that stand still, and why others are left out.
+
+    Args:
+        batch: of the drive.
+        x: (G,) first constants.
+        numbers: of the markers, in the order of the drive.
+    """
+    poses, counted = [keyframe_poses(batch, c, x) for c in range(len(batch.cars))], known_cars(batch)
     own: dict[str, int] = {}
     standing, notes = [], {}
     for i, number in enumerate(numbers):
-        found = [_seen(batch, c, x, poses[c], i) for c in counted]
-        origin, ray = (np.concatenate(part) for part in zip(*found, strict=True))
+        origin, ray = _seen_by(batch, counted, x, poses, i)
         if len(ray) < LEAST_FRAMES // 2:
             notes[number] = "too few sightings while the car moves"
             continue
@@ -363,7 +381,7 @@ def place_errors(batch: Batch, fit: Fit) -> Array:
     return found
 
 
-def same_names(template: Any, numbers: Sequence[int], places: Array) -> dict[int, str]:
+def same_names(template: Scenario, numbers: Sequence[int], places: Array) -> dict[int, str]:
     """Return the names of landmarks of an environment by the numbers of markers that stand at their places."""
     marks = [mark for mark in template.landmarks if mark.motion.kind == "static"]
     if not marks:

@@ -290,31 +290,33 @@ def of_frozen_streams(car: CarStreams) -> Iterator[Finding]:
         yield from islice(found(car), 1)
 
 
-def _frozen_velocity(car: CarStreams) -> Iterator[Finding]:
-    truth_time, place, wheel = (car.tracks[name] for name in ("truth_time", "truth", "wheel"))
-    for begin, end, first in frozen(car.tracks["wheel_time"], wheel):
+def _repeated(car: CarStreams, kind: str) -> Iterator[tuple[float, int, NDArray[np.bool_]]]:
+    """Yield durations, s, first places and poses of motion capture (n,) of the runs of equal wheel or gyro values."""
+    truth_time = car.tracks["truth_time"]
+    for begin, end, first in frozen(car.tracks[f"{kind}_time"], car.tracks[kind]):
         inside = (truth_time >= begin) & (truth_time <= end)
-        if inside.sum() < 3:
-            continue
-        speed, there = float(abs(wheel[first])), place[inside]
-        way, claimed = float(np.abs(np.diff(there[::5])).sum()), speed * (end - begin)
-        far = max(claimed, float(np.ptp(np.abs(there - there[0]))))
+        if inside.sum() > 2:
+            yield end - begin, first, inside
+
+
+def _frozen_velocity(car: CarStreams) -> Iterator[Finding]:
+    for lasted, first, inside in _repeated(car, "wheel"):
+        speed, place = float(abs(car.tracks["wheel"][first])), car.tracks["truth"][inside]
+        way, claimed = float(np.abs(np.diff(place[::5])).sum()), speed * lasted
+        far = max(claimed, float(np.ptp(np.abs(place - place[0]))))
         if abs(way - claimed) > max(STUCK, 0.1 * way) and far > STUCK:
-            text = f"the velocity of {car.name} is {speed:.3g} m/s in a row for {end - begin:.1f} s, in which "
+            text = f"the velocity of {car.name} is {speed:.3g} m/s in a row for {lasted:.1f} s, in which "
             text += f"motion capture moves it by {way:.2f} m"
             yield Finding(car.topic(MOVING), text, way - claimed, None, "", Treatment.REFUSED, car.name)
 
 
 def _frozen_turning(car: CarStreams) -> Iterator[Finding]:
-    truth_time, yaw, gyro = (car.tracks[name] for name in ("truth_time", "truth_yaw", "gyro"))
-    for begin, end, first in frozen(car.tracks["gyro_time"], gyro):
-        inside = (truth_time >= begin) & (truth_time <= end)
-        if inside.sum() < 3:
-            continue
-        rate = float(gyro[first]) + 0.0  # no negative zero
-        turned = float(np.ptp(np.unwrap(yaw[inside]) - rate * truth_time[inside]))
+    for lasted, first, inside in _repeated(car, "gyro"):
+        rate = float(car.tracks["gyro"][first]) + 0.0  # no negative zero
+        yaw = np.unwrap(car.tracks["truth_yaw"][inside])
+        turned = float(np.ptp(yaw - rate * car.tracks["truth_time"][inside]))
         if turned > TURNED:
-            text = f"the turn rate of {car.name} is {rate:.3g} rad/s in a row for {end - begin:.1f} s, in which "
+            text = f"the turn rate of {car.name} is {rate:.3g} rad/s in a row for {lasted:.1f} s, in which "
             text += f"motion capture turns it by {math.degrees(turned):.0f} deg"
             yield Finding(car.topic(TURNING), text, turned, None, "", Treatment.REFUSED, car.name)
 
