@@ -11,20 +11,21 @@ Statistical Association 63, 1968.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter, percentile_filter
 from scipy.stats import theilslopes
 
-from coopenv.cars.backend.binding import Binding, marker_places
 from coopenv.cars.bags.topic_map import TRUTH, Chosen
-from coopenv.cars.messages.readings import Sample, sightings_of, tracks_of
 from coopenv.cars.settings.profile import Role
 from coopenv.estimation.poses import Array
+
+if TYPE_CHECKING:
+    from coopenv.cars.doctor.streams import CarStreams
 
 Times = NDArray[np.int64]
 
@@ -295,45 +296,40 @@ def turn_of(times: Array, azimuths: Array, places: Array) -> SampledSignal | Non
 CAMERAS = (Role.DETECTIONS, Role.BEARINGS)
 
 
-def leads_of(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Binding) -> dict[str, Lead]:
+def leads_of(cars: Iterable["CarStreams"]) -> dict[str, Lead]:
     """Return the lead of the stamps of the vehicles' topics by their measurements.
 
     The reference is motion capture, or the camera where there is none; topics without enough motion are left out.
     """
     found: dict[str, Lead] = {}
-    start = samples[0].stamp if samples else 0
-    for car, vehicle in binding.cars.items():
-        topics = {entry.role: entry.topic for entry in chosen if entry.car == car}
-        if not topics:  # a car that is left out
-            continue
-        own = {role: [sample for sample in samples if (sample.car, sample.role) == (car, role)] for role in topics}
-        moved = {role: _cumulated(tracks_of(own[role], start)) for role in topics if role in ODOMETRY}
-        truth = _path(tracks_of(own[Role.TRUTH], start)) if Role.TRUTH in topics else None
-        camera = next(role for role in CAMERAS if role in topics)
-        seen = azimuths_of(own[camera], start, binding, vehicle)
-        place = np.array(binding.scenario.cameras[vehicle].position[:2])
+    for car in cars:
+        moved = {role: _cumulated(car, role) for role in ODOMETRY if role in car.topics}
+        truth, seen = _path(car.tracks), car.sightings_in_plane
+        camera = next(role for role in CAMERAS if role in car.topics)
         leads: dict[Role, Lead | None] = {}
         if truth is not None:
             for role, signals in moved.items():
                 each = [lead_of_motion(s, r) for s, r in zip(signals, truth[:2], strict=True) if s is not None]
                 leads[role] = min((lead for lead in each if lead), key=lambda lead: lead.error, default=None)
-            leads[camera] = lead_of_bearings(*seen, place, truth[2])
+            leads[camera] = lead_of_bearings(*seen, car.lever[:2], truth[2])
         else:
             turned = turn_of(*seen)
             known = {role: turn for role, (_, turn) in moved.items() if turn is not None}
             leads |= {role: lead_of_motion(turn, turned, PARALLAX) for role, turn in known.items()} if turned else {}
-        reference = f"the camera of {car}" if truth is None else TRUTH
-        found |= {topics[r]: replace(lead, first=r.value, reference=reference) for r, lead in leads.items() if lead}
+        reference = f"the camera of {car.name}" if truth is None else TRUTH
+        found |= {car.topics[r]: replace(lead, first=r.value, reference=reference) for r, lead in leads.items() if lead}
     return found
 
 
 ODOMETRY = (Role.WHEEL, Role.IMU, Role.ODOMETRY)
 
 
-def _cumulated(tracks: Mapping[str, Any]) -> tuple[SampledSignal | None, SampledSignal | None]:
+def _cumulated(car: "CarStreams", role: Role) -> tuple[SampledSignal | None, SampledSignal | None]:
     """Return cumulated distances and turns of a topic; None: it does not measure them."""
-    rates = ((tracks["wheel_time"], tracks["wheel"].real), (tracks["gyro_time"], tracks["gyro"]))
-    distance, turn = (SampledSignal.of_rates(t, v) if len(t) > 1 and np.ptp(v) > 0.0 else None for t, v in rates)
+    distance, turn = (
+        SampledSignal.of_rates(car.tracks[time], values) if car.is_of(time, role) and np.ptp(values) > 0.0 else None
+        for time, values in (("wheel_time", car.tracks["wheel"].real), ("gyro_time", car.tracks["gyro"]))
+    )
     return distance, turn
 
 
@@ -345,15 +341,6 @@ def _path(tracks: Mapping[str, Any]) -> tuple[SampledSignal, SampledSignal, Samp
     forward = (np.diff(place) * np.exp(-0.5j * (heading[1:] + heading[:-1]))).real
     path = SampledSignal(t, np.column_stack([place.real, place.imag, heading]))
     return SampledSignal(t, np.concatenate([[0.0], np.cumsum(forward)])), SampledSignal(t, heading), path
-
-
-def azimuths_of(samples: Sequence[Sample], start: int, binding: Binding, vehicle: int) -> tuple[Array, Array, Array]:
-    """Return times (n,), azimuths (n,) in the body frame, and positions (n, 2) of standing landmarks in view."""
-    landmarks, led = binding.scenario.landmarks, binding.leaders.values()
-    marks = {number: k for number, k in binding.targets.items() if k < len(landmarks) and k not in led}
-    time, target, ray = sightings_of(samples, start, marks)
-    body = ray @ binding.scenario.cameras[vehicle].to_body().T
-    return time, np.arctan2(body[:, 1], body[:, 0]), marker_places(landmarks)[target, :2]
 
 
 def moves_of(

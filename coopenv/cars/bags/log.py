@@ -30,7 +30,7 @@ from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TRUTH, Chosen, ClockSettings, MapFrame, TopicMap, select
 from coopenv.cars.bags.topics import NS, TopicRow, regularity
 from coopenv.cars.bags.transforms import StaticTree, odd_mountings, unread_truth
-from coopenv.cars.doctor.doctor import examine_map, examine_motion
+from coopenv.cars.doctor.doctor import examine, examine_constants
 from coopenv.cars.doctor.finding import Finding, Treatment, with_error
 from coopenv.cars.doctor.streams import Streams
 from coopenv.cars.gate.wheel_command import read_drive
@@ -409,15 +409,18 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         lenses,
         given.corrections,
     )
-    moving = examine_motion(streams, trusted)
-    for track in tracks if moving.mends else ():
-        track.entries = moving.mended(track.entries)
-    samples = _samples(tracks, clocks, {})
-    leads = leads_of(samples, chosen, binding) if mode != "received" else {}
+    examined = examine(streams, trusted)
+    for track in tracks if examined.mends else ():
+        track.entries = examined.mended(track.entries)
+    leads = leads_of(examined.cars.values()) if mode != "received" else {}
     fixed = {track.chosen.topic for track in tracks if track.source in stated}
     behind = {track.chosen.topic: seconds for track in tracks if (seconds := track.behind(clocks)) is not None}
     moves = moves_of(leads, chosen, tolerance / NS, fixed, behind)
-    samples = _samples(tracks, clocks, moves) if moves else samples
+    samples = _samples(tracks, clocks, moves)
+    for entry in chosen:
+        if entry.topic in moves and entry.car in examined.cars:
+            own = examined.cars[entry.car]
+            examined.cars[entry.car] = own.shifted(entry.sample_role, moves[entry.topic] / NS)
     notes = [*_notes(tracks, clocks, given, drifts), *_lead_notes(tracks, clocks, given, leads, moves)]
     used, turning = {e.topic for e in chosen}, {e.car for e in chosen if e.role in (Role.IMU, Role.ODOMETRY)}
     cars = [entry.car for entry in chosen if entry.role is Role.WHEEL and entry.car not in turning]
@@ -443,7 +446,8 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         added.setdefault((track.chosen.car, track.chosen.role), (topic, moved))
     rows = rows_of(files, chosen, samples, clocks, tracks, leads)
     streams = replace(streams, samples=samples, lenses=pixels, added=added)
-    findings = [*([common] if common else []), *moving.findings, *examine_map(streams, moving.findings, trusted)]
+    constants = examine_constants(examined, streams, trusted)
+    findings = [*([common] if common else []), *examined.findings, *constants]
     stating = {car: about for car, (_, about) in published.items()}
     return BagLog(samples, rows, tuple(notes), pixels, added, unknown, sent, stating, tuple(findings), streams)
 

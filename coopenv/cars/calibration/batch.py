@@ -383,9 +383,12 @@ class Batch:
         x, poses = np.zeros(len(self.kinds)), []
         for c, car in enumerate(self.cars):
             if self.truth[c]:
-                keys, yaw = self.keys[c], np.unwrap(car.truth_yaw)
-                place = np.interp(keys, car.truth_time, car.truth)
-                poses.append(np.stack([place.real, place.imag, np.interp(keys, car.truth_time, yaw)], axis=-1))
+                keys, late = self.keys[c], car.truth_time
+                near = np.interp(keys, late, np.arange(len(late))).round().astype(np.int64)
+                moved, turned = self.path(c, x).step(late[near], keys)  # motion capture may have holes
+                place, yaw = car.truth[near], np.unwrap(car.truth_yaw)[near]
+                place = place + np.exp(1j * yaw) * moved
+                poses.append(np.stack([place.real, place.imag, np.unwrap(yaw + turned)], axis=-1))
             else:
                 poses.append(self.resected(c, np.arange(len(self.places)))[0])
         free = np.zeros(len(x), dtype=bool)

@@ -1,6 +1,6 @@
 """Input of a calibration from a drive: image points, odometry and motion capture of each car, from bags and logs."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -88,8 +88,8 @@ def car_of(
     camera, start = scenario.cameras[vehicle], scenario.vehicles[vehicle].initial_pose
     pixel = np.zeros((len(ray), 2)) if lens is None else np.round(lens.pixels(ray), 3)
     place: dict[str, Any] = {"mounting": camera.to_body(), "lever": np.array(camera.position), "pixel": pixel}
-    measured.setdefault("height", start.position[2] if start is not None and start.position is not None else 0.0)
-    car = CarDrive(name=name, vehicle=vehicle, lens=lens, ray=ray, **place, **measured)
+    place["height"] = start.position[2] if start is not None and start.position is not None else 0.0
+    car = CarDrive(name=name, vehicle=vehicle, lens=lens, ray=ray, **(place | measured))
     rows = np.arange(len(ray))
     if lens is not None:
         rows = np.flatnonzero(((pixel > 1.5) & (pixel < np.array(lens.image_size) - 2.5)).all(axis=-1))
@@ -114,13 +114,11 @@ def car_of(
     return car
 
 
-def drive_of_streams(streams: Streams, where: str, names: Iterable[str] | None = None) -> CalibrationDrive:
+def drive_of_streams(streams: Streams, where: str, chosen: Sequence[CarStreams] | None = None) -> CalibrationDrive:
     """Return the drive of some cars, None: of all. Raises DataError, which begins with `where`: too few sightings."""
-    chosen = streams.binding.cars if names is None else names
-    cars = tuple(_of_car(streams, streams.car(name), where) for name in chosen)
-    scenario = streams.binding.scenario
-    marks = tuple(scenario.landmarks[i].name for i in streams.standing)
-    return CalibrationDrive(cars, marks, streams.places, scenario)
+    streamed = [streams.car(name) for name in streams.binding.cars] if chosen is None else chosen
+    cars = tuple(_of_car(streams, car, where) for car in streamed)
+    return CalibrationDrive(cars, streamed[0].names, streamed[0].places, streams.binding.scenario)
 
 
 def _of_car(streams: Streams, car: CarStreams, where: str) -> CarDrive:
@@ -129,7 +127,8 @@ def _of_car(streams: Streams, car: CarStreams, where: str) -> CarDrive:
     right = streams.corrections.get(name, Correction())
     tracks = {key: value for key, value in car.tracks.items() if "command" not in key}
     found = {"time": car.time, "target": car.target, "topics": tuple(topics[:3]), "gyro_added": topics[3][1], **tracks}
-    found["corrected"] = (right.wheel_scale, right.gyro_bias)
+    found["height"] = car.height
+    found |= {"corrected": (right.wheel_scale, right.gyro_bias), "mounting": car.mounting, "lever": car.lever}
     return car_of(streams.binding.scenario, name, car.vehicle, car.lens, car.ray, where, **found)
 
 

@@ -21,28 +21,31 @@ from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive, drive_of
 from coopenv.cars.doctor.finding import Finding, Treatment
 from coopenv.cars.doctor.motion import SPEED_FACTORS
 from coopenv.cars.doctor.sight import BAD, REMOVED
-from coopenv.cars.doctor.streams import Streams
+from coopenv.cars.doctor.streams import CarStreams, Streams
 from coopenv.cars.messages.vision import rays
 
 TRIED = 2  # hypotheses that are fitted in a round
 GAIN = 5.0
 """Gain of the linearised cost from which a hypothesis is fitted: a third of the gain that calibration accepts."""
+SIGHTINGS, POSES = 1200, 25.0
+"""Sightings, and poses of motion capture in a second, that are enough: what counts as wrong is coarser."""
 COARSE = 2.0
 """Times the deviation that counts as wrong in a calibration, below which constants are no finding here."""
 
 
-def of_constants(streams: Streams, name: str, truth: bool) -> Iterator[Finding]:
-    """Yield wrong constants of a car: camera, wheels, gyro, clocks and markers; `truth`: motion capture counts."""
+def of_constants(streams: Streams, car: CarStreams) -> Iterator[Finding]:
+    """Yield wrong constants of a car: camera, wheels, gyro, clocks and markers."""
+    name = car.name
     try:
-        drive = drive_of_streams(streams, name, [name])
+        drive = drive_of_streams(streams, name, [car])
+        drive = replace(drive, cars=(thinned(drive.cars[0]),))
         if len(drive.places) < 2 or not np.ptp(drive.places, axis=0).any():
             return
-        batch = Batch(drive, truth)
-        pairs = exchanged(batch)
-        for i, j in pairs:
+        batch = Batch(drive, True)
+        blind = not any(batch.truth)
+        for i, j in exchanged(batch) if blind else ():
             text = f"markers {drive.landmarks[i]} and {drive.landmarks[j]} are exchanged"
             yield Finding("markers", text, treatment=Treatment.REFUSED, car=name)
-        blind = not any(batch.truth)
         if blind and (found := _coarse(drive, name, BAD)):
             yield found
             return
@@ -55,6 +58,15 @@ def of_constants(streams: Streams, name: str, truth: bool) -> Iterator[Finding]:
         yield from _wrong(batch, fit, name)
     except (DataError, np.linalg.LinAlgError):  # too short a drive, or one that determines no pose
         return
+
+
+def thinned(car: CarDrive) -> CarDrive:
+    """Return a car with few enough sightings and poses of motion capture, which are in even steps of their order."""
+    rows = slice(None, None, 1 + len(car.time) // SIGHTINGS)
+    kept = {name: getattr(car, name)[rows] for name in ("time", "target", "ray", "pixel")}
+    late = slice(None, None, 1 + len(car.truth_time) // max(1, round(POSES * float(np.ptp(car.time)))))
+    kept |= {name: getattr(car, name)[late] for name in ("truth_time", "truth", "truth_yaw")}
+    return replace(car, **kept)
 
 
 def _wrong(batch: Batch, fit: Fit, name: str) -> Iterator[Finding]:

@@ -1,36 +1,48 @@
-"""The gate: all checks of streams, the treatment of what contradicts, and the streams without it."""
+"""The gate: all checks of streams, the treatment of what contradicts, and the streams without it.
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+A fault hides others. So the first check that finds one is mended in memory, whatever its treatment, and all checks look
+again, until no check finds more. A fault without which the others explain everything is taken back at the end, as a
+backward elimination of regressors does. Source: Draper and Smith, Applied Regression Analysis, 1998, chapter 15.
+"""
+
+import re
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from coopenv.cars.bags.clocks import CAMERAS
 from coopenv.cars.doctor.constants import of_constants
-from coopenv.cars.doctor.finding import Finding, Treatment
-from coopenv.cars.doctor.motion import LEAST, of_frozen_streams, of_turning, of_velocity, turns_contradict
-from coopenv.cars.doctor.sight import BAD, explanation, of_sight, sight_of
+from coopenv.cars.doctor.finding import Diagnosis, Finding, Treatment
+from coopenv.cars.doctor.motion import of_frozen_streams, of_turning, of_velocity, turns_contradict
+from coopenv.cars.doctor.sight import of_sight
 from coopenv.cars.doctor.streams import TURNING, CarStreams, Streams
-from coopenv.cars.doctor.turning import turn_contradiction
+from coopenv.cars.doctor.turning import constant_turn_rate
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist
 from coopenv.cars.settings.profile import Role
-from coopenv.estimation.poses import Array
 
 REMOVED = (Treatment.MENDED, Treatment.LEFT_OUT)
 """Treatments after which a stream is without the fault."""
 FEW = 20  # detections
 SHORT = 2.0
 """s up to which a contradiction refuses no drive."""
+ROUNDS = 6
+"""Times that all checks look at a car."""
 Mend = Callable[[Sample], Sample | None]
 """Returns a sample without a fault; None: it is left out."""
 
 
 @dataclass
 class Examined:
-    """The findings of a gate, and the mends of samples."""
+    """The findings of a gate, the mends of samples, and the streams without all faults that are known."""
 
     findings: list[Finding] = field(default_factory=list)
     mends: list[Mend] = field(default_factory=list)
+    cars: dict[str, CarStreams] = field(default_factory=dict)
+    spoilt: set[str] = field(default_factory=set)
+    """Cars with a fault that nothing removes."""
+    parts: set[str] = field(default_factory=set)
+    """Constants that are estimated already, by the titles of a calibration."""
 
     def mended(self, samples: Sequence[Sample]) -> list[Sample]:
         """Return samples without the faults that are mended."""
@@ -44,8 +56,8 @@ def treated(finding: Finding, trusted: Collection[str]) -> Finding:
     return replace(finding, treatment=Treatment.TRUSTED) if {finding.subject, "all"} & {*trusted} else finding
 
 
-def examine_motion(streams: Streams, trusted: Collection[str] = ()) -> Examined:
-    """Return what is wrong with turn rates and velocities of all cars.
+def examine(streams: Streams, trusted: Collection[str] = ()) -> Examined:
+    """Return what is wrong with the streams of all cars, but for constants and clocks.
 
     Args:
         streams: of a bag or of live cars.
@@ -56,59 +68,75 @@ def examine_motion(streams: Streams, trusted: Collection[str] = ()) -> Examined:
         car = streams.car(name)
         if not car.samples:
             continue
-        for finding in _of_motion(streams, car):
-            mend = _mend_of(finding, car)
-            finding = treated(finding, trusted)
+        diagnoses = diagnosed(car)
+        found.cars[name] = changed(car, diagnoses)
+        for each in diagnoses:
+            mend, finding = _mend_of(each.finding, car), treated(each.finding, trusted)
             found.findings.append(finding)
+            found.parts |= {*each.parts}
             if finding.treatment in REMOVED:
                 found.mends.append(mend)
+            elif each.change is None:
+                found.spoilt.add(name)
+        found.findings += [treated(finding, trusted) for finding in _of_detections(car)]
     return found
 
 
-def _of_motion(streams: Streams, car: CarStreams) -> Iterator[Finding]:
-    scenario = streams.binding.scenario
-    mounting = scenario.cameras[car.vehicle].to_body()
-    practical = max(LEAST, 3.0 * scenario.noises[car.vehicle].odometry_scale)
-    if why := turn_contradiction(car.samples, streams.binding, car.name):
+def diagnosed(car: CarStreams) -> list[Diagnosis]:
+    """Return the faults of a car that together explain what its streams contradict."""
+    found: list[Diagnosis] = []
+    for _ in range(ROUNDS):
+        new = next(_unnamed(changed(car, found), found), [])
+        if not new:
+            break
+        found += new
+    for each in found[:-1]:
+        others = [other for other in found if other is not each]
+        if not any(_unnamed(changed(car, others), others)):
+            found = others
+    return found
+
+
+def changed(car: CarStreams, diagnoses: Iterable[Diagnosis]) -> CarStreams:
+    """Return a car without the faults that are known."""
+    for each in diagnoses:
+        car = car if each.change is None else each.change(car)
+    return car
+
+
+def _unnamed(car: CarStreams, named: Sequence[Diagnosis]) -> Iterator[list[Diagnosis]]:
+    """Yield what each check finds, but for what is named already, in the order in which faults hide each other."""
+    known = {_words(each.finding) for each in named}
+    for check in (_of_constant_turning, of_frozen_streams, of_sight, _of_motion):
+        if new := [each for each in check(car) if _words(each.finding) not in known]:
+            yield new
+
+
+def _words(finding: Finding) -> tuple[str, str]:
+    """Return the subject and the text of a finding without its numbers."""
+    return finding.subject, re.sub(r"[-\d.()]+", "", finding.text.partition(":")[0])
+
+
+def _of_constant_turning(car: CarStreams) -> Iterator[Diagnosis]:
+    if why := constant_turn_rate(car.tracks, car.sightings_in_plane, car.wheelbase):
         text, lasted = f"the turn rate of {car.name} {why}", np.ptp(car.tracks["gyro_time"])
         treatment = Treatment.REFUSED if lasted > SHORT else Treatment.USED
-        yield Finding(car.topic(TURNING), text, treatment=treatment, car=car.name)
-        return
-    frozen = [*of_frozen_streams(car)]
-    yield from frozen
-    if not frozen:
-        use_truth = not _truth_is_wrong(streams, car, mounting)
-        yield from of_turning(car, mounting, practical, use_truth)
-        yield from of_velocity(car, practical, use_truth)
+        about = Finding(car.topic(TURNING), text, treatment=treatment, car=car.name)
+        yield Diagnosis(about, (lambda car: car.following_truth("gyro")) if car.truth_signals else None)
 
 
-def _truth_is_wrong(streams: Streams, car: CarStreams, mounting: Array) -> bool:
-    """Return whether bearings show that motions by motion capture are wrong."""
-    sight = sight_of(streams, car, _height(streams, car))
-    if sight is None or sight.misfit() < BAD:
-        return False
-    found = explanation(sight, car, *names_of(streams))
-    wrong = any(cause.subject == car.topic([Role.TRUTH]) and not cause.rigid for cause in found)
-    return wrong or (not found and turns_contradict(car, mounting))
-
-
-def names_of(streams: Streams) -> tuple[list[str], dict[int, int]]:
-    """Return the names of the standing landmarks, and the numbers of their markers by landmark."""
-    standing = streams.standing
-    names = [streams.binding.scenario.landmarks[i].name for i in standing]
-    return names, {standing.index(t): n for n, t in streams.binding.targets.items() if t in standing}
-
-
-def _height(streams: Streams, car: CarStreams) -> float:
-    """Return the height of a car's origin, m, as a calibration has it."""
-    start = streams.binding.scenario.vehicles[car.vehicle].initial_pose
-    return start.position[2] if start is not None and start.position is not None else 0.0
+def _of_motion(car: CarStreams) -> Iterator[Diagnosis]:
+    unexplained = any(each.change is None for each in of_sight(car))
+    use_truth = not (unexplained and turns_contradict(car))
+    if np.ptp(car.tracks["gyro"]) > 0.0 if len(car.tracks["gyro"]) else False:
+        yield from of_turning(car, use_truth)
+    yield from of_velocity(car, use_truth)
 
 
 def _mend_of(finding: Finding, car: CarStreams) -> Mend:
     """Return the change of samples that removes a finding that can be mended, or leaves out what repeats itself."""
     key, _, value = finding.key.partition(" = ")
-    factor, last = float(value or 1.0), [np.full(3, np.nan)]
+    factor, last = float(value or 1.0) if key.endswith("_factor") else 1.0, [np.full(3, np.nan)]
 
     def mend(sample: Sample) -> Sample | None:
         twist = sample.value
@@ -131,31 +159,20 @@ def _mend_of(finding: Finding, car: CarStreams) -> Mend:
     return mend
 
 
-def examine_map(streams: Streams, before: Sequence[Finding] = (), trusted: Collection[str] = ()) -> list[Finding]:
-    """Return what is wrong with cameras, map, motion capture and constants of all cars.
+def examine_constants(found: Examined, streams: Streams, trusted: Collection[str] = ()) -> list[Finding]:
+    """Return wrong constants of all cars; of cars with a fault that nothing removes they are not looked at.
 
     Args:
-        streams: of a bag, their velocities and turn rates mended.
-        before: findings of the motion; constants of a car of which one is not mended are not looked at.
+        found: the examination of the cars, whose streams are without the faults that are known.
+        streams: of a bag.
         trusted: subjects of findings that stay unchanged.
     """
-    found = examine_sight(streams, trusted)
-    spoilt = {finding.car for finding in (*before, *found) if finding.treatment not in REMOVED}
-    for name in streams.binding.cars:
-        if name not in spoilt and any(sample.car == name for sample in streams.samples):
-            found += [treated(finding, trusted) for finding in of_constants(streams, name, True)]
-    return [*dict.fromkeys(found)]
-
-
-def examine_sight(streams: Streams, trusted: Collection[str] = ()) -> list[Finding]:
-    """Return the coarse part of `examine_map`: without least squares, and only with motion capture."""
-    found: list[Finding] = []
-    for name in streams.binding.cars:
-        car = streams.car(name)
-        found += _of_detections(car)
-        sight = sight_of(streams, car, _height(streams, car))
-        found += [] if sight is None else of_sight(sight, car, *names_of(streams))
-    return [treated(finding, trusted) for finding in found]
+    constants: list[Finding] = []
+    for name, car in found.cars.items():
+        if name not in found.spoilt:
+            new = (finding for finding in of_constants(streams, car) if finding.subject not in found.parts)
+            constants += [treated(finding, trusted) for finding in new]
+    return [*dict.fromkeys(constants)]
 
 
 OUTSIDE = 0.1

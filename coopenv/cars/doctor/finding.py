@@ -1,8 +1,12 @@
 """A finding: one stream that the others contradict, by how much, the key that mends it, and the treatment."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from math import ceil, floor, inf, log10
+from typing import NamedTuple
+
+from coopenv.cars.doctor.streams import CarStreams
 
 
 class Treatment(Enum):
@@ -40,6 +44,20 @@ class Finding:
         mended = self.treatment is Treatment.MENDED
         key = f"; {'mended, as with' if mended else 'mended by'} {self.key}" if self.key else ""
         return f"{subject}: {self.text}{key}{'; trusted' if self.treatment is Treatment.TRUSTED else ''}"
+
+
+Change = Callable[[CarStreams], CarStreams]
+"""Returns the streams of a car without a fault."""
+
+
+class Diagnosis(NamedTuple):
+    """A finding, and the change with which the examination looks for what it hides, whatever its treatment."""
+
+    finding: Finding
+    change: Change | None = None
+    """None: nothing is known that removes it."""
+    parts: tuple[str, ...] = ()
+    """Constants that the change has estimated, by the titles of a calibration."""
 
 
 def with_error(value: float, error: float) -> str:

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from coopenv.cars.backend.binding import Binding
-from coopenv.cars.doctor.doctor import examine_motion, examine_sight
+from coopenv.cars.doctor.doctor import examine
 from coopenv.cars.doctor.finding import Finding, Treatment
 from coopenv.cars.doctor.streams import Streams
-from coopenv.cars.doctor.turning import turn_contradiction
+from coopenv.cars.doctor.turning import constant_turn_rate
 from coopenv.cars.messages.readings import Sample, Twist
 
 KEPT = 6_000  # samples of a car, some 20 s
@@ -50,8 +50,11 @@ class StreamMonitor:
         self._kept[sample.car].append(sample)
 
     def contradiction(self, car: str) -> str | None:
-        """Return what contradicts a turn rate that never changes, see `turn_contradiction`."""
-        return None if car in self._turning else turn_contradiction([*self._kept[car]], self._binding, car)
+        """Return what contradicts a turn rate that never changes, see `constant_turn_rate`."""
+        if car in self._turning:
+            return None
+        streams = Streams([*self._kept[car]], self._binding, {}).car(car)
+        return constant_turn_rate(streams.tracks, streams.sightings_in_plane, streams.wheelbase)
 
     def findings(self) -> list[Finding]:
         """Return the streams that others contradict; a result holds for a second of the samples."""
@@ -80,7 +83,7 @@ def examined(samples: Sequence[Sample], binding: Binding, trusted: Collection[st
     moved = [name for name in binding.cars if _moved(streams, name)]
     if not moved:
         return {}
-    found = [*examine_motion(streams, trusted).findings, *examine_sight(streams, trusted)]
+    found = examine(streams, trusted).findings
     counted = [f for f in found if f.explained and f.treatment not in (Treatment.TRUSTED, Treatment.LEFT_OUT)]
     return {car: [replace(f, treatment=Treatment.REFUSED) for f in counted if f.car == car] for car in moved}
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.cars.bags.clocks import SampledSignal, turn_of
-from coopenv.cars.doctor.finding import Finding, Treatment, with_error
+from coopenv.cars.doctor.finding import Change, Diagnosis, Finding, Treatment, with_error
 from coopenv.cars.doctor.relation import Relation, intervals, relation
 from coopenv.cars.doctor.streams import MOVING, TURNING, CarStreams
 from coopenv.cars.doctor.turning import TURNED
@@ -50,34 +50,13 @@ LEAST = 0.05
 """Practical size: a scale by which 20 s of driving at 0.3 m/s are 0.3 m off without bearings."""
 
 
-def body_rays(car: CarStreams, mounting: Array) -> Array:
-    """Return the rays (m, 3) of sightings in the body frame."""
-    return car.ray @ mounting.T
-
-
-def bearing_turn(car: CarStreams, mounting: Array) -> SampledSignal | None:
+def bearing_turn(car: CarStreams) -> SampledSignal | None:
     """Return the heading by the median change of the azimuths of landmarks, translation included; None: too few."""
     if len(car.time) < 2:
         return None
-    body = body_rays(car, mounting)
+    body = car.ray @ car.mounting.T
     places = np.stack([car.target.astype(np.float64), np.zeros(len(car.target))], axis=-1)
     return turn_of(car.time, np.arctan2(body[:, 1], body[:, 0]), places)
-
-
-def truth_signals(car: CarStreams) -> tuple[SampledSignal, SampledSignal] | None:
-    """Return place (x, y) and heading by motion capture; None: there is too little."""
-    time, place, yaw = (car.tracks[name] for name in ("truth_time", "truth", "truth_yaw"))
-    if len(time) < 2:
-        return None
-    return SampledSignal(time, np.column_stack([place.real, place.imag])), SampledSignal(time, np.unwrap(yaw))
-
-
-def own_signals(car: CarStreams) -> tuple[SampledSignal, SampledSignal] | None:
-    """Return place and heading by the poses of the odometry's own messages; None: it has none, or they never change."""
-    if len(car.pose_time) < 2 or np.ptp(np.abs(car.pose - car.pose[0])) == 0.0:
-        return None
-    place = np.column_stack([car.pose.real, car.pose.imag])
-    return SampledSignal(car.pose_time, place), SampledSignal(car.pose_time, car.pose_yaw)
 
 
 def turning_factor(car: CarStreams, heading: SampledSignal, axis: int = 2) -> Relation | None:
@@ -99,18 +78,17 @@ def named(factor: float, factors: dict[str, float], within: float = NAMED) -> tu
     return close[0] if close else None
 
 
-def of_turning(car: CarStreams, mounting: Array, practical: float, use_truth: bool) -> Iterator[Finding]:
-    """Yield what is wrong with sign, unit and axes of turn rates.
+def of_turning(car: CarStreams, use_truth: bool) -> Iterator[Diagnosis]:
+    """Yield what is wrong with sign, unit and axes of turn rates; `use_truth`: motion capture is a reference.
 
     Without motion capture bearings are the reference; translation then explains factors between 0.5 and 2.
     """
-    topic, seen = car.topic(TURNING), bearing_turn(car, mounting)
-    truth, own = truth_signals(car), own_signals(car)
-    if truth is not None and use_truth:
-        reference, what, least = truth[1], "motion capture", practical
-    elif own is not None:
-        reference, what, least = own[1], "its own poses", practical
-    elif seen is not None:
+    topic, least = car.topic(TURNING), practical_scale(car)
+    if car.truth_signals is not None and use_truth:
+        reference, what = car.truth_signals[1], "motion capture"
+    elif car.own_signals is not None:
+        reference, what = car.own_signals[1], "its own poses"
+    elif (seen := bearing_turn(car)) is not None:
         reference, what, least = seen, "bearings", 1.0
     else:
         return
@@ -126,17 +104,26 @@ def of_turning(car: CarStreams, mounting: Array, practical: float, use_truth: bo
     known = named(factor, FACTORS, TRANSLATED if what == "bearings" else NAMED)
     size = with_error(factor, found.error)
     text = f"the turn rate of {car.name} is {size} times that of {what}"
-    if known is None:
-        key = f"corrections.{car.name}.gyro_factor = {1.0 / factor:.4g}"
-        yield Finding(topic, text, factor, found.error, key, Treatment.REFUSED, car.name)
-        return
-    key = f"corrections.{car.name}.gyro_factor = {1.0 / known[1]:.6g}"
-    yield Finding(topic, f"{text} ({known[0]})", factor, found.error, key, Treatment.MENDED, car.name)
+    exact, treatment = (factor, Treatment.REFUSED) if known is None else (known[1], Treatment.MENDED)
+    key = f"corrections.{car.name}.gyro_factor = {1.0 / exact:.{4 if known is None else 6}g}"
+    text += "" if known is None else f" ({known[0]})"
+    about = Finding(topic, text, factor, found.error, key, treatment, car.name)
+    yield Diagnosis(about, turned_by(np.eye(3) / exact))
 
 
-def turns_contradict(car: CarStreams, mounting: Array) -> bool:
+def practical_scale(car: CarStreams) -> float:
+    """Return the relative scale up to which a scale is no finding."""
+    return max(LEAST, 3.0 * car.scale_noise)
+
+
+def turned_by(matrix: Array) -> Change:
+    """Return the change of turn rates by a matrix (3, 3)."""
+    return lambda car: car.with_turning(matrix)
+
+
+def turns_contradict(car: CarStreams) -> bool:
     """Return whether turns by motion capture contradict both bearings and turn rates, which agree with each other."""
-    truth, seen = truth_signals(car), bearing_turn(car, mounting)
+    truth, seen = car.truth_signals, bearing_turn(car)
     if truth is None or seen is None:
         return False
     by_truth, by_bearings = turning_factor(car, truth[1]), turning_factor(car, seen)
@@ -146,18 +133,23 @@ def turns_contradict(car: CarStreams, mounting: Array) -> bool:
     return agree and (by_truth.explained < FOLLOWS or not 0.5 < by_truth.factor.real < 2.0)
 
 
-def _other_axis(car: CarStreams, reference: SampledSignal, what: str, topic: str, found: Relation) -> Iterator[Finding]:
+def _other_axis(
+    car: CarStreams, reference: SampledSignal, what: str, topic: str, found: Relation
+) -> Iterator[Diagnosis]:
     """Yield which axis measures the turns of a car, or that no axis does."""
     for axis, name in enumerate("xy"):
         other = turning_factor(car, reference, axis)
         if other is not None and other.explained > FOLLOWS:
             size = with_error(other.factor.real, other.error)
             text = f"{car.name} turns about the {name} axis of its gyro ({size} times {what}), and not about z"
-            yield Finding(topic, text, other.factor.real, other.error, "", Treatment.REFUSED, car.name)
+            about = Finding(topic, text, other.factor.real, other.error, "", Treatment.REFUSED, car.name)
+            right = np.eye(3)[[2, 1, 0] if axis == 0 else [0, 2, 1]]
+            yield Diagnosis(about, turned_by(right / other.factor.real))
             return
     if what != "bearings":
         text = f"the turn rate of {car.name} does not follow {what}: it explains {max(0.0, found.explained):.0%} of it"
-        yield Finding(topic, text, found.factor.real, found.error, car=car.name, explained=False)
+        about = Finding(topic, text, found.factor.real, found.error, car=car.name, explained=False)
+        yield Diagnosis(about, lambda car: car.following_truth("gyro"))
 
 
 def velocity_relations(
@@ -212,15 +204,9 @@ def _planar(change: Array) -> NDArray[np.complex128]:
     return np.asarray(change[:, 0] + 1j * change[:, 1])
 
 
-def of_velocity(car: CarStreams, practical: float, use_truth: bool) -> Iterator[Finding]:
-    """Yield what is wrong with sign, unit, axes and frame of velocities.
-
-    Args:
-        car: its streams.
-        practical: relative scale up to which a scale is no finding.
-        use_truth: whether motion capture is a reference.
-    """
-    topic, truth, own = car.topic(MOVING), truth_signals(car) if use_truth else None, own_signals(car)
+def of_velocity(car: CarStreams, use_truth: bool) -> Iterator[Diagnosis]:
+    """Yield what is wrong with sign, unit, axes and frame of velocities; `use_truth`: motion capture is a reference."""
+    topic, truth, own = car.topic(MOVING), car.truth_signals if use_truth else None, car.own_signals
     for paths, what in ((own, "its own poses"), (truth, "motion capture")):
         if paths is None:
             continue
@@ -228,20 +214,28 @@ def of_velocity(car: CarStreams, practical: float, use_truth: bool) -> Iterator[
         if body is None or room is None:
             continue
         if room.explained > FOLLOWS and (1.0 - room.explained) < 0.5 * (1.0 - body.explained):
-            yield _in_the_room(car, topic, what, room, own is paths)
+            yield _in_the_room(car, topic, what, room, paths[1], own is paths)
             return
         if body.explained < FOLLOWS:
             text = (
                 f"the velocity of {car.name} does not follow {what}: it explains {max(0.0, body.explained):.0%} of it"
             )
-            yield Finding(topic, text, body.explained, car=car.name, explained=False)
+            about = Finding(topic, text, body.explained, car=car.name, explained=False)
+            yield Diagnosis(about, lambda car: car.following_truth("wheel"))
             return
-        if body.differs(practical):
+        if body.differs(practical_scale(car)):
             yield _velocity(car, topic, what, body)
             return
 
 
-def _in_the_room(car: CarStreams, topic: str, what: str, room: Relation, own: bool) -> Finding:
+def moved_by(factor: complex) -> Change:
+    """Return the change of velocities by a factor."""
+    return lambda car: car.with_tracks(wheel=factor * car.tracks["wheel"])
+
+
+def _in_the_room(
+    car: CarStreams, topic: str, what: str, room: Relation, heading: SampledSignal, own: bool
+) -> Diagnosis:
     """Return the finding of velocities in the frame of the map."""
     angle = math.degrees(float(np.angle(room.factor)))
     turned = f", turned by {angle:.0f} deg" if abs(angle) > 3.0 else ""
@@ -251,28 +245,38 @@ def _in_the_room(car: CarStreams, topic: str, what: str, room: Relation, own: bo
     )
     treatment = Treatment.MENDED if own and not turned else Treatment.REFUSED
     key = "its own poses, which turn it" if own and not turned else ""
-    return Finding(topic, text, abs(room.factor), room.error, key, treatment, car.name)
+
+    def change(car: CarStreams) -> CarStreams:
+        time = np.clip(car.tracks["wheel_time"], heading.times[0], heading.times[-1])
+        yaw = np.interp(time, heading.times, heading.values[:, 0])
+        return moved_by(np.exp(-1j * np.angle(room.factor)))(
+            car.with_tracks(wheel=car.tracks["wheel"] * np.exp(-1j * yaw))
+        )
+
+    return Diagnosis(Finding(topic, text, abs(room.factor), room.error, key, treatment, car.name), change)
 
 
-def _velocity(car: CarStreams, topic: str, what: str, body: Relation) -> Finding:
+def _velocity(car: CarStreams, topic: str, what: str, body: Relation) -> Diagnosis:
     """Return the finding of a wrong sign, unit, scale or direction of velocities."""
     size, angle = abs(body.factor), math.degrees(float(np.angle(body.factor)))
     signed = size if abs(angle) < 90.0 else -size
     crooked = abs(math.sin(math.radians(angle))) > 0.3
     if crooked or (signed > 0.0 and abs(body.factor.imag) > abs(size - 1.0)):
-        shown, treatment = with_error(angle, math.degrees(body.error / size)), Treatment.REFUSED
+        shown, treatment = with_error(angle, math.degrees(body.error / size)), Treatment.USED
         text = f"the velocity of {car.name} points {shown} deg to the left of the motion by {what}"
-        if not crooked:
-            return Finding(topic, text, angle, math.degrees(body.error / size), car=car.name)
-        return Finding(topic, f"{text}: other axes", angle, math.degrees(body.error / size), "", treatment, car.name)
+        if crooked:
+            text, treatment = f"{text}: other axes", Treatment.REFUSED
+        about = Finding(topic, text, angle, math.degrees(body.error / size), "", treatment, car.name)
+        return Diagnosis(about, moved_by(np.exp(-1j * np.angle(body.factor))))
     known = named(signed, SPEED_FACTORS)
     exact = signed if known is None else known[1]
     text = f"the velocity of {car.name} is {with_error(signed, body.error)} times that of {what}"
     key = f"corrections.{car.name}.wheel_factor = {1.0 / exact:.6g}"
+    treatment = Treatment.REFUSED if abs(size - 1.0) > 0.3 else Treatment.USED
     if known is not None:
-        return Finding(topic, f"{text} ({known[0]})", signed, body.error, key, Treatment.MENDED, car.name)
-    far = abs(size - 1.0) > 0.3
-    return Finding(topic, text, signed, body.error, key, Treatment.REFUSED if far else Treatment.USED, car.name)
+        text, treatment = f"{text} ({known[0]})", Treatment.MENDED
+    parts = (f"{car.name}: wheel scale",) if known is None else ()
+    return Diagnosis(Finding(topic, text, signed, body.error, key, treatment, car.name), moved_by(1.0 / exact), parts)
 
 
 FROZEN = 1.0
@@ -281,7 +285,7 @@ STUCK = 0.15
 """m by which a position by wheels and one by motion capture may differ over such a time, 0.15 m/s for a second."""
 
 
-def of_frozen_streams(car: CarStreams) -> Iterator[Finding]:
+def of_frozen_streams(car: CarStreams) -> Iterator[Diagnosis]:
     """Yield streams that repeat a value while another one shows that the car moves."""
     tracks = car.tracks
     if len(tracks["truth_time"]) < 3 or len(tracks["wheel_time"]) < 2:
@@ -290,38 +294,40 @@ def of_frozen_streams(car: CarStreams) -> Iterator[Finding]:
         yield from islice(found(car), 1)
 
 
-def _repeated(car: CarStreams, kind: str) -> Iterator[tuple[float, int, NDArray[np.bool_]]]:
-    """Yield durations, s, first places and poses of motion capture (n,) of the runs of equal wheel or gyro values."""
+def _repeated(car: CarStreams, kind: str) -> Iterator[tuple[float, float, int, NDArray[np.bool_]]]:
+    """Yield begins, ends, s, first places and poses of motion capture (n,) of runs of equal wheel or gyro values."""
     truth_time = car.tracks["truth_time"]
     for begin, end, first in frozen(car.tracks[f"{kind}_time"], car.tracks[kind]):
         inside = (truth_time >= begin) & (truth_time <= end)
         if inside.sum() > 2:
-            yield end - begin, first, inside
+            yield begin, end, first, inside
 
 
-def _frozen_velocity(car: CarStreams) -> Iterator[Finding]:
-    for lasted, first, inside in _repeated(car, "wheel"):
-        speed, place = float(abs(car.tracks["wheel"][first])), car.tracks["truth"][inside]
+def _frozen_velocity(car: CarStreams) -> Iterator[Diagnosis]:
+    for begin, end, first, inside in _repeated(car, "wheel"):
+        speed, place, lasted = float(abs(car.tracks["wheel"][first])), car.tracks["truth"][inside], end - begin
         way, claimed = float(np.abs(np.diff(place[::5])).sum()), speed * lasted
         far = max(claimed, float(np.ptp(np.abs(place - place[0]))))
         if abs(way - claimed) > max(STUCK, 0.1 * way) and far > STUCK:
             text = f"the velocity of {car.name} is {speed:.3g} m/s in a row for {lasted:.1f} s, in which "
             text += f"motion capture moves it by {way:.2f} m"
-            yield Finding(car.topic(MOVING), text, way - claimed, None, "", Treatment.REFUSED, car.name)
+            about = Finding(car.topic(MOVING), text, way - claimed, None, "", Treatment.REFUSED, car.name)
+            yield Diagnosis(about, lambda car, b=begin, e=end: car.following_truth("wheel", b, e))  # type: ignore[misc]
 
 
-def _frozen_turning(car: CarStreams) -> Iterator[Finding]:
-    for lasted, first, inside in _repeated(car, "gyro"):
+def _frozen_turning(car: CarStreams) -> Iterator[Diagnosis]:
+    for begin, end, first, inside in _repeated(car, "gyro"):
         rate = float(car.tracks["gyro"][first]) + 0.0  # no negative zero
         yaw = np.unwrap(car.tracks["truth_yaw"][inside])
         turned = float(np.ptp(yaw - rate * car.tracks["truth_time"][inside]))
         if turned > TURNED:
-            text = f"the turn rate of {car.name} is {rate:.3g} rad/s in a row for {lasted:.1f} s, in which "
+            text = f"the turn rate of {car.name} is {rate:.3g} rad/s in a row for {end - begin:.1f} s, in which "
             text += f"motion capture turns it by {math.degrees(turned):.0f} deg"
-            yield Finding(car.topic(TURNING), text, turned, None, "", Treatment.REFUSED, car.name)
+            about = Finding(car.topic(TURNING), text, turned, None, "", Treatment.REFUSED, car.name)
+            yield Diagnosis(about, lambda car, b=begin, e=end: car.following_truth("gyro", b, e))  # type: ignore[misc]
 
 
-def _frozen_truth(car: CarStreams) -> Iterator[Finding]:
+def _frozen_truth(car: CarStreams) -> Iterator[Diagnosis]:
     wheel_time, wheel = car.tracks["wheel_time"], car.tracks["wheel"]
     for begin, end, _ in frozen(car.tracks["truth_time"], car.tracks["truth"] + 1e3 * car.tracks["truth_yaw"]):
         moving = (wheel_time >= begin) & (wheel_time <= end)
@@ -329,7 +335,15 @@ def _frozen_truth(car: CarStreams) -> Iterator[Finding]:
         if way > 2.0 * STUCK:
             text = f"motion capture repeats one pose of {car.name} for {end - begin:.1f} s, in which "
             text += f"its wheels move it by {way:.2f} m"
-            yield Finding(car.topic([Role.TRUTH]), text, way, None, "", Treatment.LEFT_OUT, car.name)
+            about = Finding(car.topic([Role.TRUTH]), text, way, None, "", Treatment.LEFT_OUT, car.name)
+            yield Diagnosis(about, _without_repeated_poses)
+
+
+def _without_repeated_poses(car: CarStreams) -> CarStreams:
+    """Return a car without poses of motion capture that equal those before them."""
+    place = car.tracks["truth"]
+    kept = np.append(True, np.diff(place) != 0.0)
+    return car.with_tracks(**{name: car.tracks[name][kept] for name in ("truth_time", "truth", "truth_yaw")})
 
 
 def frozen(time: Array, values: NDArray[Any]) -> Iterator[tuple[float, float, int]]:

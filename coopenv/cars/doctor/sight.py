@@ -4,55 +4,49 @@ Every cause is a change of one stream. The cause counts under which bearings fit
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from coopenv.cars.bags.clocks import CAMERAS
 from coopenv.cars.calibration.batch import misfit, seen_from
-from coopenv.cars.doctor.finding import Finding, Treatment, with_error
-from coopenv.cars.doctor.motion import truth_signals
-from coopenv.cars.doctor.streams import CarStreams, Streams
+from coopenv.cars.calibration.calibrate import INTRINSICS
+from coopenv.cars.doctor.finding import Change, Diagnosis, Finding, Treatment, with_error
+from coopenv.cars.doctor.streams import CarStreams, Planar
 from coopenv.cars.messages.vision import Calibration, rays
 from coopenv.cars.settings.profile import Role
 from coopenv.estimation.lens import distort
 from coopenv.estimation.poses import Array
 
-FEWEST, MOST = 12, 400  # sightings
+FEWEST, MOST = 12, 300  # sightings
 BAD = 0.004
 """Mean misfit, of angles of 3.6 deg, above which a coarse cause is looked for; smaller ones are calibration's."""
 OFF_DEG = 3.6
 REMOVED = 0.35
 """Share of the misfit that the cause leaves at most."""
+SMALL_DEG, SMALL_LOG = 6.0, math.log(1.2)
+"""Mountings (deg) and focal lengths (logarithm of the factor) from which a calibration finds the right ones."""
+LATE = (-0.4, -0.2, -0.1, 0.1, 0.2, 0.4)
+"""s, offsets of clocks that are tried beside other causes; the clocks themselves are looked at elsewhere."""
 
 
 @dataclass(frozen=True)
 class PosedSightings:
     """Sightings with the poses by motion capture at their times."""
 
-    place: NDArray[np.complex128]
+    place: Planar
     yaw: Array
-    ray: Array  # (m, 3) optical
-    point: Array  # (m, 3) m
-    target: NDArray[np.int64]
-    places: Array  # (L, 3) m
-    mounting: Array
-    lever: Array
-    height: float
-
-    def ahead(self) -> Array:
-        """Return the vectors (m, 3) from the camera to the markers in the body frame, m."""
-        flat = np.exp(-1j * self.yaw) * (self.point[:, 0] + 1j * self.point[:, 1] - self.place)
-        return np.stack([flat.real, flat.imag, self.point[:, 2] - self.height], axis=-1) - self.lever
+    ray: Array  # (m, 3) unit vectors, body
+    ahead: Array
+    """(m, 3) from the camera to the markers in the body frame, m."""
 
     def off_deg(self) -> Array:
         """Return the angles (m,) between rays and markers, deg."""
-        ahead = self.ahead()
-        cosine = ((self.ray @ self.mounting.T) * ahead).sum(axis=-1) / np.linalg.norm(ahead, axis=-1)
+        cosine = (self.ray * self.ahead).sum(axis=-1) / np.linalg.norm(self.ahead, axis=-1)
         return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
     def off_share(self) -> float:
@@ -61,131 +55,193 @@ class PosedSightings:
 
     def misfit(self) -> float:
         """Return the mean of (2 sin(angle / 2))^2 up to 0.04 between rays and markers."""
-        return misfit(self.ray @ self.mounting.T, self.ahead())
+        return misfit(self.ray, self.ahead)
 
 
-def sight_of(streams: Streams, car: CarStreams, height: float) -> PosedSightings | None:
-    """Return the sightings of a car with its poses by motion capture; None: too few, or the map has a single place."""
-    truth = truth_signals(car)
-    if len(streams.places) < 2 or not np.ptp(streams.places, axis=0).any() or truth is None or len(car.time) < FEWEST:
+def thinned(car: CarStreams) -> CarStreams | None:
+    """Return a car with few of its sightings, all with a pose; None: too few, or the map has a single place."""
+    if len(car.places) < 2 or not np.ptp(car.places, axis=0).any() or car.truth_signals is None:
         return None
     rows = np.arange(len(car.time))[:: max(1, len(car.time) // MOST)]
-    pose = np.column_stack([signal.over(car.time[rows], car.time[rows], level=True) for signal in truth])
-    rows, pose = rows[np.isfinite(pose).all(axis=1)], pose[np.isfinite(pose).all(axis=1)]
+    pose = np.column_stack([signal.over(car.time[rows], car.time[rows], level=True) for signal in car.truth_signals])
+    rows = rows[np.isfinite(pose).all(axis=1)]
     if len(rows) < FEWEST:
         return None
-    camera, places, target = streams.binding.scenario.cameras[car.vehicle], streams.places, car.target[rows]
-    return PosedSightings(
-        *(pose[:, 0] + 1j * pose[:, 1], pose[:, 2], car.ray[rows], places[target], target, places),
-        *(camera.to_body(), np.array(camera.position), height),
-    )
+    return replace(car, time=car.time[rows], target=car.target[rows], ray=car.ray[rows])
+
+
+def sight_of(car: CarStreams) -> PosedSightings:
+    """Return the sightings of a thinned car with its poses by motion capture."""
+    assert car.truth_signals is not None
+    track, heading = car.truth_signals
+    time = np.clip(car.time, track.times[0], track.times[-1])
+    x, y = track.over(time, time, level=True).T
+    yaw, point = heading.over(time, time, level=True)[:, 0], car.places[car.target]
+    there = np.isfinite(x) & np.isfinite(yaw)  # a change of the time moves some into a hole
+    place, yaw, point = (x + 1j * y)[there], yaw[there], point[there]
+    flat = np.exp(-1j * yaw) * (point[:, 0] + 1j * point[:, 1] - place)
+    ahead = np.stack([flat.real, flat.imag, point[:, 2] - car.height], axis=-1) - car.lever
+    return PosedSightings(place, yaw, car.ray[there] @ car.mounting.T, ahead)
 
 
 @dataclass(frozen=True)
 class Cause:
     """A change of a stream that would explain a misfit."""
 
-    subject: str
+    subject: str  # empty: a clock, which is looked at elsewhere
     text: str
-    changed: PosedSightings
+    change: Change
     size: float | None = None
     error: float | None = None
     key: str = ""
     free: int = 0  # numbers that were fitted
-    rigid: bool = False  # whether motions stay what they are
+    parts: tuple[str, ...] = ()  # constants among these, as of a `Diagnosis`
+    small: bool = False  # whether a calibration begins near enough to find it, among other constants
 
 
 UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "feet": 0.3048}
 MIRRORS = {"x has the other sign": (-1.0, 1.0), "y has the other sign": (1.0, -1.0)}
 
 
-def causes(sight: PosedSightings, car: CarStreams, names: list[str], numbers: dict[int, int]) -> Iterator[Cause]:
-    """Yield the possible causes; `names` of the landmarks, `numbers` of the markers by landmark."""
-    for i, j in combinations(sorted(set(sight.target.tolist())), 2):
-        swapped = np.where(sight.target == i, j, np.where(sight.target == j, i, sight.target))
-        right = {i: numbers.get(j), j: numbers.get(i)}
-        entries = (f"{names[k]} = {right.get(k, number)}" for k, number in sorted(numbers.items()))
+def of_map(matrix: Any) -> Change:
+    """Return the change of all places by a matrix (3, 3)."""
+    return lambda car: replace(car, places=car.places @ np.asarray(matrix).T)
+
+
+def of_truth(place: Callable[[Planar], Planar], yaw: Callable[[Array], Array]) -> Change:
+    """Return the change of places and headings by motion capture."""
+    return lambda car: car.with_tracks(truth=place(car.tracks["truth"]), truth_yaw=yaw(car.tracks["truth_yaw"]))
+
+
+def of_image(across: float, down: float) -> Change:
+    """Return the change of pixels by signs, about the middle of the image."""
+
+    def change(car: CarStreams) -> CarStreams:
+        if car.lens is None:
+            return replace(car, ray=car.ray * [across, down, 1.0])
+        middle = 0.5 * (np.array(car.lens.image_size) - 1.0)
+        pixels = middle + (car.lens.pixels(car.ray) - middle) * [across, down]
+        ray, there = rays(pixels, replace(car.lens, image_size=(100_000, 100_000)))
+        return replace(car, ray=np.where(there[:, None], ray, car.ray * [across, down, 1.0]))
+
+    return change
+
+
+def of_lens(right: Calibration) -> Change:
+    """Return the change to another lens, by the same pixels."""
+
+    def change(car: CarStreams) -> CarStreams:
+        if car.lens is None:
+            return car
+        ray, there = rays(car.lens.pixels(car.ray), replace(right, image_size=(100_000, 100_000)))
+        return replace(car, ray=np.where(there[:, None], ray, car.ray), lens=right)
+
+    return change
+
+
+def exchanged_targets(i: int, j: int) -> Change:
+    """Return the change of two landmarks into each other."""
+
+    def change(car: CarStreams) -> CarStreams:
+        return replace(car, target=np.where(car.target == i, j, np.where(car.target == j, i, car.target)))
+
+    return change
+
+
+def causes(car: CarStreams, every: bool = True) -> Iterator[Cause]:
+    """Yield the possible causes; not `every`: those without a search."""
+    for i, j in combinations(sorted(set(car.target.tolist())), 2) if every else ():
+        right = {i: car.numbers.get(j), j: car.numbers.get(i)}
+        entries = (f"{car.names[k]} = {right.get(k, number)}" for k, number in sorted(car.numbers.items()))
         key = f"markers = {{ {', '.join(entries)} }}"
-        text = f"markers {names[i]} and {names[j]} are exchanged"
-        yield Cause("markers", text, replace(sight, point=sight.places[swapped]), key=key)
-    yield from _of_map(sight)
-    yield from _of_truth(sight, car)
-    yield from _of_camera(sight, car)
-
-
-def _of_map(sight: PosedSightings) -> Iterator[Cause]:
-    def moved(point: Array) -> PosedSightings:
-        return replace(sight, point=point)
-
+        text = f"markers {car.names[i]} and {car.names[j]} are exchanged"
+        yield Cause("markers", text, exchanged_targets(i, j), key=key)
     for unit, metres in UNITS.items():
-        yield Cause(
-            "landmarks", f"positions of landmarks are in {unit}, and not in m", moved(metres * sight.point), metres
-        )
+        yield Cause("landmarks", f"positions of landmarks are in {unit}, and not in m", of_map(metres * np.eye(3)))
     for what, signs in MIRRORS.items():
-        yield Cause("landmarks", f"the map is mirrored: {what}", moved(sight.point * [*signs, 1.0]))
-    yield Cause("landmarks", "the map has x and y exchanged", moved(sight.point[:, [1, 0, 2]]))
+        yield Cause("landmarks", f"the map is mirrored: {what}", of_map(np.diag([*signs, 1.0])))
+    yield Cause("landmarks", "the map has x and y exchanged", of_map([[0, 1, 0], [1, 0, 0], [0, 0, 1]]))
+    yield from _of_truth(car)
+    if every:
+        yield _of_frame(car)
+    yield from _of_camera(car)
+    role = next((role for role in CAMERAS if role in car.topics), CAMERAS[0])
+    for seconds in LATE:
+        yield Cause("", "", lambda car, s=seconds: car.shifted(role, s), free=1)  # type: ignore[misc]
 
 
-def _of_truth(sight: PosedSightings, car: CarStreams) -> Iterator[Cause]:
+def _of_truth(car: CarStreams) -> Iterator[Cause]:
     topic = car.topic([Role.TRUTH])
     for unit, metres in UNITS.items():
-        text = f"it is in {unit}, and not in m"
-        yield Cause(topic, text, replace(sight, place=metres * sight.place), metres)
-    mirrored = replace(sight, place=sight.place.conj(), yaw=-sight.yaw)
-    yield Cause(topic, "it is mirrored: y has the other sign", mirrored)
-    yield Cause(topic, "its heading has the other sign", replace(sight, yaw=-sight.yaw))
+        yield Cause(topic, f"it is in {unit}, and not in m", of_truth(lambda p, k=metres: k * p, _same))  # type: ignore[misc]
+    yield Cause(topic, "it is mirrored: y has the other sign", of_truth(np.conj, np.negative))
+    yield Cause(topic, "its heading has the other sign", of_truth(_same, np.negative))
     for deg in (90.0, -90.0, 180.0):
-        turned = replace(sight, yaw=sight.yaw + math.radians(deg))
+        turned = of_truth(_same, lambda yaw, d=deg: yaw + math.radians(d))  # type: ignore[misc]
         yield Cause(topic, f"its body is turned by {-deg:g} deg", turned, -deg)
+
+
+def _of_frame(car: CarStreams) -> Cause:
+    """Return the frame of motion capture in which bearings fit best."""
+    topic, sight = car.topic([Role.TRUTH]), sight_of(car)
     turn = Rotation.from_euler("z", sight.yaw[:, None])
     origin = np.stack([sight.place.real, sight.place.imag, 0.0 * sight.yaw], axis=-1)
-    lever, unit = origin + turn.apply(sight.lever), turn.apply(sight.ray @ sight.mounting.T)
-    _, angle, shift = seen_from(unit, lever, sight.point - [0.0, 0.0, sight.height])
-    place, degrees = np.exp(1j * angle) * sight.place + shift, (math.degrees(angle) + 180.0) % 360.0 - 180.0
+    lever, unit = origin + turn.apply(car.lever), turn.apply(sight.ray)
+    point = origin + turn.apply(sight.ahead + car.lever)
+    _, angle, shift = seen_from(unit, lever, point)
+    degrees = (math.degrees(angle) + 180.0) % 360.0 - 180.0
     key = (
         f"frames.truth = {{ position = [{shift.real:.3f}, {shift.imag:.3f}, 0.0], yaw = {math.radians(degrees):.4f} }}"
     )
     text = f"its frame is {degrees:.1f} deg and {abs(shift):.2f} m from that of the map"
-    yield Cause(topic, text, replace(sight, place=place, yaw=sight.yaw + angle), degrees, None, key, 3, True)
+    moved = of_truth(lambda p: np.exp(1j * angle) * p + shift, lambda yaw: yaw + angle)
+    return Cause(topic, text, moved, degrees, None, key, 3, ("frame of motion capture",))
 
 
-def _of_camera(sight: PosedSightings, car: CarStreams) -> Iterator[Cause]:
-    camera = f"camera of {car.name}"
+def _same(values: Any) -> Any:
+    return values
 
-    def seen(ray: Array) -> PosedSightings:
-        return replace(sight, ray=ray)
 
-    yield Cause(camera, "its image is mirrored", seen(sight.ray * [-1.0, 1.0, 1.0]))
-    yield Cause(camera, "its image is upside down", seen(sight.ray * [-1.0, -1.0, 1.0]))
-    yield Cause(camera, "its bearings point from the target to the camera", seen(-sight.ray))
-    expected = sight.ahead() / np.linalg.norm(sight.ahead(), axis=-1, keepdims=True)
-    kept = np.ones(len(expected), dtype=bool)
+def _of_camera(car: CarStreams) -> Iterator[Cause]:
+    camera, sight = f"camera of {car.name}", sight_of(car)
+    yield Cause(camera, "its image is mirrored", of_image(-1.0, 1.0))
+    yield Cause(camera, "its image is upside down", of_image(-1.0, -1.0))
+    reversed_ray = "its bearings point from the target to the camera"
+    yield Cause(camera, reversed_ray, lambda car: replace(car, ray=-car.ray))
+    expected = sight.ahead / np.linalg.norm(sight.ahead, axis=-1, keepdims=True)
+    kept, optical = np.ones(len(expected), dtype=bool), sight.ray @ car.mounting
     for _ in range(3):
-        turn, _ = Rotation.align_vectors(expected[kept], sight.ray[kept])
-        off = np.linalg.norm(turn.apply(sight.ray) - expected, axis=-1)
+        turn, _ = Rotation.align_vectors(expected[kept], optical[kept])
+        off = np.linalg.norm(turn.apply(optical) - expected, axis=-1)
         kept = off <= 3.0 * np.median(off) + 1e-9
-    wrong = (turn * Rotation.from_matrix(sight.mounting).inv()).as_rotvec(degrees=True)
+    wrong = (turn * Rotation.from_matrix(car.mounting).inv()).as_rotvec(degrees=True)
     text = f"its mounting is {np.linalg.norm(wrong):.1f} deg from the given one (roll, pitch, yaw {_listed(wrong)} deg)"
     quaternion = _listed(turn.as_quat()[[3, 0, 1, 2]], 4)
     key = f"overrides.vehicles.{car.vehicle}.camera.orientation = [{quaternion}]"
-    turned = replace(sight, mounting=turn.as_matrix())
-    yield Cause(camera, text, turned, float(np.linalg.norm(wrong)), None, key, 3)
+    matrix = turn.as_matrix()
+    parts = (f"{car.name}: camera orientation", f"{car.name}: camera position")
+    yield Cause(
+        *(camera, text, lambda car: replace(car, mounting=matrix), float(np.linalg.norm(wrong))),
+        None,
+        key,
+        3,
+        parts,
+        float(np.linalg.norm(wrong)) < SMALL_DEG,
+    )
     if car.lens is not None:
-        yield from _intrinsics(sight, car, car.lens, camera, expected @ sight.mounting)
+        yield from _intrinsics(car, car.lens, camera, optical, expected @ car.mounting)
     if car.lens is not None and any(car.lens.distortion):
         flat = replace(car.lens, distortion=(0.0,) * len(car.lens.distortion))
         text = "its lens is corrected already: pixels of rectified images, or bearings without distortion"
-        yield Cause(camera, text, seen(rays(car.lens.pixels(sight.ray), flat)[0]), key="vision.rectified = true")
+        yield Cause(camera, text, of_lens(flat), key="vision.rectified = true")
 
 
-def _intrinsics(
-    sight: PosedSightings, car: CarStreams, lens: Calibration, camera: str, optical: Array
-) -> Iterator[Cause]:
+def _intrinsics(car: CarStreams, lens: Calibration, camera: str, ray: Array, expected: Array) -> Iterator[Cause]:
     """Yield other focal lengths and principal points: lines through pixels by those of the right ones."""
-    rows = np.flatnonzero((optical[:, 2] > 0.3) & (sight.ray[:, 2] > 0.2))
+    rows = np.flatnonzero((expected[:, 2] > 0.3) & (ray[:, 2] > 0.2))
     if len(rows) < 2 * FEWEST:
         return
-    flat, pixel = distort(optical[rows, :2] / optical[rows, 2:], lens.distortion), lens.pixels(sight.ray[rows])
+    flat, pixel = distort(expected[rows, :2] / expected[rows, 2:], lens.distortion), lens.pixels(ray[rows])
     lines = []
     for axis in range(2):
         columns, kept = np.column_stack([flat[:, axis], np.ones(len(rows))]), np.ones(len(rows), dtype=bool)
@@ -198,14 +254,15 @@ def _intrinsics(
     (fx, cx, error), (fy, cy, _) = lines
     if min(fx, fy) < 10.0:
         return
-    right = replace(lens, focal_length=(fx, fy), principal_point=(cx, cy), image_size=(100_000, 100_000))
-    ray, there = rays(lens.pixels(sight.ray), right)
     factor = lens.focal_length[0] / fx
+    width, height = (round(side / factor) for side in lens.image_size)
+    right = replace(lens, focal_length=(fx, fy), principal_point=(cx, cy), image_size=(width, height))
     size = with_error(factor, factor * error / fx)
     text = f"its focal length is {size} times that of its images (another size, binning or region of interest?)"
     key = f"corrections.{car.name} = {{ focal_length = [{fx:.1f}, {fy:.1f}], principal_point = [{cx:.1f}, {cy:.1f}] }}"
-    ray = np.where(there[:, None], ray, sight.ray)
-    yield Cause(camera, text, replace(sight, ray=ray), factor, factor * error / fx, key, 4)
+    parts = tuple(f"{car.name}: {part}" for part in INTRINSICS)
+    small = abs(math.log(factor)) < SMALL_LOG
+    yield Cause(camera, text, of_lens(right), factor, factor * error / fx, key, 4, parts, small)
 
 
 def _listed(values: Any, digits: int = 1) -> str:
@@ -216,48 +273,56 @@ FAR = 10.0
 """Times the extent of the landmarks, beyond which motion capture is at another place, or in another unit."""
 
 
-def of_sight(sight: PosedSightings, car: CarStreams, names: list[str], numbers: dict[int, int]) -> Iterator[Finding]:
+def of_sight(given: CarStreams) -> Iterator[Diagnosis]:
     """Yield the causes, at most two, of a coarse misfit between bearings, map and motion capture."""
-    given, topic = sight.misfit(), car.topic([Role.TRUTH])
-    if given < BAD:
+    if (car := thinned(given)) is None or (sight := sight_of(car)).misfit() < BAD:
         return
-    found = explanation(sight, car, names, numbers)
-    explained = bool(found)
+    topic, found, changed = car.topic([Role.TRUTH]), explanation(car), car
+    for cause in found:
+        changed = cause.change(changed)
+    rest = f", and {sight_of(changed).off_share():.0%} with that mended" if found else ""
     ask = " (are heading, unit and frames.truth right?)"
-    for cause in found or [Cause(topic, "no single cause explains it", sight)]:
-        rest = f", and {found[-1].changed.off_share():.0%} with that mended" if found else ""
+    for cause in found or [Cause(topic, "no single cause explains it", _same)]:
         off = f"{sight.off_share():.0%} of the bearings are off by more than {OFF_DEG} deg{rest}"
         text, treatment = f"{cause.text}: {off}", Treatment.REFUSED
         if cause.subject == topic:
             off = f"{np.median(sight.off_deg()):.0f} deg off the bearings to landmarks (median)"
-            text = f"motion capture of {car.name}, topic {topic}, is {_far(sight) or off}: {cause.text}{ask}"
+            text = f"motion capture of {car.name}, topic {topic}, is {_far(car, sight) or off}: {cause.text}{ask}"
             treatment = Treatment.USED
-        yield Finding(cause.subject, text, cause.size, cause.error, cause.key, treatment, car.name, explained)
+        if cause.subject and not cause.small:
+            about = Finding(cause.subject, text, cause.size, cause.error, cause.key, treatment, car.name, bool(found))
+            yield Diagnosis(about, cause.change if found else None, cause.parts)
 
 
-TRIED = 5  # first causes to which a second one is looked for
+TRIED = 4  # first causes to which every second one is tried; to the others those that need no search
 
 
-def explanation(sight: PosedSightings, car: CarStreams, names: list[str], numbers: dict[int, int]) -> list[Cause]:
-    """Return the cause, or the two together, that remove a misfit; none: no two do."""
-
-    def ranked(of: PosedSightings) -> list[tuple[float, Cause]]:
-        tried = [(c.changed.misfit() * (1.0 + 0.2 * c.free), c) for c in causes(of, car, names, numbers)]
-        return sorted(tried, key=lambda pair: pair[0])
-
-    given, first = sight.misfit(), ranked(sight)
-    if first[0][1].changed.misfit() < min(REMOVED * given, BAD):
-        return [first[0][1]]
-    pairs = [(misfit, one, two) for _, one in first[:TRIED] for misfit, two in ranked(one.changed)[:1]]
-    _, one, two = min(pairs, key=lambda pair: pair[0])
-    if two.changed.misfit() < min(REMOVED * REMOVED * given, BAD):
+def explanation(car: CarStreams) -> list[Cause]:
+    """Return the cause, or the two together, that remove the misfit of a thinned car; none: no two do."""
+    given, first = sight_of(car).misfit(), _ranked(car, causes(car))
+    least, best, changed = first[0]
+    if sight_of(changed).misfit() < min(REMOVED * given, BAD):
+        return [best]
+    pairs = []
+    for n, (_, one, other) in enumerate(first):
+        if n < TRIED or not (one.free or one.subject == "markers"):
+            pairs += [(one, *second) for second in _ranked(other, causes(other, n < TRIED))[:1]]
+    one, _, two, changed = min(pairs, key=lambda pair: pair[1])
+    if sight_of(changed).misfit() < min(REMOVED * REMOVED * given, BAD):
         return [one, two]
-    return [first[0][1]] if first[0][1].changed.misfit() < REMOVED * given else []
+    return [best] if least < REMOVED * given else []
 
 
-def _far(sight: PosedSightings) -> str:
+def _ranked(car: CarStreams, some: Iterable[Cause]) -> list[tuple[float, Cause, CarStreams]]:
+    """Return misfits, more for each number that was fitted, causes, and a car without each; the best first."""
+    tried = ((cause, cause.change(car)) for cause in some)
+    found = [(sight_of(other).misfit() * (1.0 + 0.2 * cause.free), cause, other) for cause, other in tried]
+    return sorted(found, key=lambda entry: entry[0])
+
+
+def _far(car: CarStreams, sight: PosedSightings) -> str:
     """Return how far motion capture is from all landmarks; nothing where it is near."""
-    flat = sight.places[:, :2]
+    flat = car.places[:, :2]
     width = float(np.linalg.norm(np.ptp(flat, axis=0)))
     away = float(np.median(np.abs(sight.place[:, None] - (flat[:, 0] + 1j * flat[:, 1])).min(axis=1)))
     return f"{away:.3g} m from landmarks that span {width:.3g} m" if width and away > FAR * width else ""

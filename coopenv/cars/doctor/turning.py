@@ -1,15 +1,12 @@
 """Turn rates that never change while something else shows that the car turns: a dead gyro, wheels that measure none."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import median_filter
 
-from coopenv.cars.backend.binding import Binding
-from coopenv.cars.bags.clocks import CAMERAS, azimuths_of
-from coopenv.cars.messages.readings import Sample, tracks_of
 from coopenv.estimation.poses import Array
 
 TURNED = math.radians(10.0)  # of a car, by anything else than its turn rate
@@ -18,23 +15,14 @@ WINDOW, NOISE, SIGNIFICANT = 0.4, math.radians(2.0), 3.0
 TRIM = 0.1  # rad of steering with which a car may drive straight on
 
 
-def turn_contradiction(samples: Sequence[Sample], binding: Binding, car: str) -> str | None:
-    """Return in words what contradicts a turn rate that is the same in all samples of a car; None: nothing does."""
-    if not samples:
-        return None
-    start, vehicle = samples[0].stamp, binding.cars[car]
-    seen = azimuths_of([sample for sample in samples if sample.role in CAMERAS], start, binding, vehicle)
-    return constant_turn_rate(tracks_of(samples, start), seen, binding.scenario.limits[vehicle].wheelbase)
-
-
 def constant_turn_rate(
     tracks: Mapping[str, Any], sightings: tuple[Array, Array, Array], wheelbase: float
 ) -> str | None:
-    """Return what contradicts a turn rate as `turn_contradiction` does.
+    """Return in words what contradicts a turn rate that is the same in all messages of a car; None: nothing does.
 
     Args:
         tracks: of a car, see `coopenv.cars.messages.readings.tracks_of`.
-        sightings: times (n,), s, azimuths (n,), rad, in the body frame and positions (n, 2) of standing landmarks.
+        sightings: as of `CarStreams.sightings_in_plane`.
         wheelbase: of the car, m.
     """
     rates = tracks["gyro"]

@@ -15,12 +15,12 @@ import pytest
 
 from coopenv.cars.backend.binding import Binding, bind
 from coopenv.cars.bags.clocks import SampledSignal
-from coopenv.cars.doctor.doctor import examine_map, examine_motion
+from coopenv.cars.doctor.doctor import examine, examine_constants
 from coopenv.cars.doctor.finding import Treatment, with_error
 from coopenv.cars.doctor.live import StreamMonitor
 from coopenv.cars.doctor.motion import of_frozen_streams, velocity_relations
 from coopenv.cars.doctor.relation import relation
-from coopenv.cars.doctor.sight import sight_of
+from coopenv.cars.doctor.sight import thinned
 from coopenv.cars.doctor.streams import Streams
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist
 from coopenv.cars.messages.vision import Calibration
@@ -181,9 +181,8 @@ def streams_of(change: Change | None, truth: bool = True, seed: int = 0, places:
 
 
 def findings_of(streams: Streams, trusted: tuple[str, ...] = ()) -> list[Any]:
-    moving = examine_motion(streams, trusted)
-    mended = replace(streams, samples=moving.mended(streams.samples))
-    return [*moving.findings, *examine_map(mended, moving.findings, trusted)]
+    found = examine(streams, trusted)
+    return [*found.findings, *examine_constants(found, streams, trusted)]
 
 
 @pytest.mark.parametrize("name", FAULTS)
@@ -232,14 +231,14 @@ def test_two_faults_are_both_named() -> None:
 
 def test_mended_turn_rates_are_those_of_the_sound_drive() -> None:
     streams = streams_of(FAULTS["gyro in degrees"][0])
-    mended = examine_motion(streams).mended(streams.samples)
+    mended = examine(streams).mended(streams.samples)
     rates = [s.value.angular for s in mended if s.role is Role.IMU]
     np.testing.assert_allclose(rates, [s.value.angular for s in driven() if s.role is Role.IMU], rtol=1e-6)
 
 
 def test_a_trusted_topic_stays_unchanged_and_is_named() -> None:
     streams = streams_of(FAULTS["gyro reversed"][0])
-    [found] = (moving := examine_motion(streams, ("/car/imu",))).findings
+    [found] = (moving := examine(streams, ("/car/imu",))).findings
     assert found.treatment is Treatment.TRUSTED and str(found).endswith("; trusted") and not moving.mends
 
 
@@ -253,9 +252,9 @@ def test_a_pose_of_their_own_turns_velocities_of_the_room() -> None:
         return Twist(near.rotation @ value.linear, None, near)
 
     streams = streams_of(change)
-    [found] = examine_motion(streams).findings
+    [found] = examine(streams).findings
     assert "in the frame of its own poses" in found.text and found.treatment is Treatment.MENDED
-    mended = [s.value.linear for s in examine_motion(streams).mended(streams.samples) if s.role is Role.WHEEL]
+    mended = [s.value.linear for s in examine(streams).mended(streams.samples) if s.role is Role.WHEEL]
     np.testing.assert_allclose(mended, [s.value.linear for s in driven() if s.role is Role.WHEEL], atol=1e-9)
 
 
@@ -299,7 +298,7 @@ def cut(samples: Sequence[Sample], begin: float, seconds: float) -> list[Sample]
 def test_a_short_sound_drive_is_silent(seconds: float, seed: int) -> None:
     for begin in (0.0, 5.0, 10.0):
         whole = streams_of(None)
-        assert not examine_motion(replace(whole, samples=cut(driven(seed), begin, seconds))).findings
+        assert not examine(replace(whole, samples=cut(driven(seed), begin, seconds))).findings
 
 
 def test_the_scale_of_wheels_is_that_of_the_arc_in_tight_turns() -> None:
@@ -329,9 +328,7 @@ def test_a_velocity_that_sticks_after_a_stand_is_found() -> None:
 
 
 def test_a_map_without_standing_landmarks_is_compared_with_nothing() -> None:
-    streams = streams_of(None)
-    blind: Any = SimpleNamespace(places=np.zeros((0, 3)), binding=streams.binding)
-    assert sight_of(blind, streams.car("car"), 0.0) is None
+    assert thinned(replace(streams_of(None).car("car"), places=np.zeros((0, 3)))) is None
 
 
 def test_an_error_that_is_not_known_has_no_brackets() -> None:
@@ -350,5 +347,5 @@ def test_a_velocity_that_points_aside_has_no_scale_as_its_key() -> None:
             return value
         return Twist(turn(np.radians(12.0)) @ value.linear, value.angular)
 
-    [found] = [f for f in examine_motion(streams_of(change)).findings if "velocity" in f.text]
+    [found] = [f for f in examine(streams_of(change)).findings if "velocity" in f.text]
     assert re.search(r"points 1[12]\.\d*\(\d+\) deg to the left", found.text) and not found.key
