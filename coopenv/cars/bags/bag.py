@@ -204,6 +204,11 @@ class Bag(TickGenerator):
         assert self.log.streams is not None
         return replace(self.log.streams, binding=self.binding)
 
+    @property
+    def is_refused(self) -> bool:
+        """Whether streams contradict each other in a way that estimates cannot stand."""
+        return any(finding.treatment is Treatment.REFUSED for finding in self.log.findings)
+
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> TickStream:
         """Go through the bags tick by tick; the option `arm` has no effect.
 

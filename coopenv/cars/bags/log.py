@@ -27,12 +27,14 @@ from coopenv.base.errors import CoopenvError, DataError, DataWarning, listed
 from coopenv.cars.backend.binding import Binding, check_calibrated
 from coopenv.cars.bags.clocks import Delay, Leads, checked, jumps, leads_of, moves_of
 from coopenv.cars.bags.files import BagFile
-from coopenv.cars.bags.topic_map import TRUTH, Chosen, ClockSettings, MapFrame, TopicMap, select
+from coopenv.cars.bags.topic_map import COMMANDS, TRUTH, UNNEEDED, Chosen, ClockSettings, MapFrame, TopicMap, select
 from coopenv.cars.bags.topics import NS, TopicRow, regularity
 from coopenv.cars.bags.transforms import StaticTree, odd_mountings, unread_truth
-from coopenv.cars.doctor.doctor import examine, examine_constants
+from coopenv.cars.doctor.doctor import Examined, examine, examine_constants, treated
 from coopenv.cars.doctor.finding import Finding, Treatment, with_error
-from coopenv.cars.doctor.streams import Streams
+from coopenv.cars.doctor.motion import IN_THE_ROOM
+from coopenv.cars.doctor.streams import MOVING, Streams
+from coopenv.cars.doctor.timing import NO_CRYSTAL, of_delays, of_drift, of_duplicates, of_frames, of_outages, of_repeats
 from coopenv.cars.gate.wheel_command import read_drive
 from coopenv.cars.messages.codec import encode, stamp_of
 from coopenv.cars.messages.detectors import PLACED
@@ -421,7 +423,8 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         if entry.topic in moves and entry.car in examined.cars:
             own = examined.cars[entry.car]
             examined.cars[entry.car] = own.shifted(entry.sample_role, moves[entry.topic] / NS)
-    notes = [*_notes(tracks, clocks, given, drifts), *_lead_notes(tracks, clocks, given, leads, moves)]
+    crystals = {topic: drift for topic, drift in drifts.items() if abs(drift) <= NO_CRYSTAL}
+    notes = [*_notes(tracks, clocks, given, crystals), *_lead_notes(tracks, clocks, given, leads, moves)]
     used, turning = {e.topic for e in chosen}, {e.car for e in chosen if e.role in (Role.IMU, Role.ODOMETRY)}
     cars = [entry.car for entry in chosen if entry.role is Role.WHEEL and entry.car not in turning]
     if (
@@ -447,13 +450,45 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     rows = rows_of(files, chosen, samples, clocks, tracks, leads)
     streams = replace(streams, samples=samples, lenses=pixels, added=added)
     constants = examine_constants(examined, streams, trusted)
-    findings = [*([common] if common else []), *examined.findings, *constants]
+    timing = [*_of_timing(tracks, samples, drifts, examined), *([common] if common else [])]
+    findings = [*(treated(finding, trusted) for finding in timing), *examined.findings, *constants]
     stating = {car: about for car, (_, about) in published.items()}
     return BagLog(samples, rows, tuple(notes), pixels, added, unknown, sent, stating, tuple(findings), streams)
 
 
-NO_CRYSTAL = 500e-6
-"""s per s, drift above which a clock is none with a quartz crystal, whose errors are below 100e-6 from -40 to 85 C."""
+def _of_timing(
+    tracks: Sequence[Track], samples: Sequence[Sample], drifts: Mapping[str, float], examined: Examined
+) -> Iterator[Finding]:
+    """Yield what is wrong with the times of messages, and with the frames that these state.
+
+    Args:
+        tracks: of the topics, without drifts.
+        samples: of all topics, on one clock.
+        drifts: of topics, which were removed.
+        examined: the gate's findings of the topics' values.
+    """
+    in_the_room = {finding.subject for finding in examined.findings if IN_THE_ROOM in finding.text}
+    truth = {s.stated.frame for s in samples if s.role is Role.TRUTH}
+    end = max((s.stamp for s in samples if s.role not in UNNEEDED), default=0)
+    by_topic = {
+        entry: [s for s in samples if (s.car, s.role) == (entry.car, entry.sample_role)]
+        for entry in dict.fromkeys(track.chosen for track in tracks)
+    }
+    for track in tracks:
+        car, topic = track.chosen.car, track.chosen.topic
+        stamps, received = (np.array([getattr(e, name) for e in track.entries]) for name in ("stamp", "received"))
+        yield from of_duplicates(stamps, topic, car)
+        yield from of_delays(stamps, received, topic, car)
+        if topic in drifts:
+            yield from of_drift(drifts[topic], topic, car)
+    for entry, own in by_topic.items():
+        if entry.role in COMMANDS:
+            continue
+        yield from of_outages(own, entry.topic, end)
+        yield from of_repeats(own, entry.topic)
+        streams = examined.cars.get(entry.car)
+        if entry.role in MOVING and streams is not None and (streams.truth_signals or streams.own_signals):
+            yield from of_frames(own, entry.topic, truth, entry.topic in in_the_room)
 
 
 REFINED = 3  # times that the rate is estimated: windows of a steep delay have a small error

@@ -18,7 +18,6 @@ Statistical Institute 52, 1987; White, Maximum likelihood estimation of misspeci
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -411,7 +410,7 @@ class Batch:
                 at, yaw = (np.interp(time, car.truth_time, v) for v in (car.truth, np.unwrap(car.truth_yaw)))
                 flat = np.exp(-1j * yaw) * (point[:, 0] + 1j * point[:, 1] - at)
                 to = np.stack([flat.real, flat.imag, point[:, 2] - car.height], axis=-1) - car.lever
-                found.append(misfit(unit, to))
+                found.append(float(misfits(unit, to)))
             total += min(found)
         return total
 
@@ -444,23 +443,32 @@ class Batch:
 def seen_from(unit: Array, lever: Array, point: Array) -> tuple[float, float, complex]:
     """Return misfit, heading and place of a body by rays (n, 3) from its `lever` (n, 3), m, to points (n, 3), m.
 
-    With a heading given, the place is linear in the sightings: all headings are tried, then finer ones.
+    With a heading given, the place is linear in the sightings: all headings are tried together, then finer ones.
     """
     across = skew(unit)
+    flat = across[:, :, :2]
+    squares = np.einsum("nik,nil->nkl", flat, flat)
 
-    def fitted(heading: float) -> tuple[float, float, complex]:
-        to = Rotation.from_euler("z", -heading).apply(point) - lever
-        b, far = (across @ to[:, :, None]), np.ones((len(to), 1, 1))
+    def fitted(headings: Array) -> tuple[float, float, complex]:
+        turn = np.exp(-1j * headings)[:, None] * (point[:, 0] + 1j * point[:, 1])
+        to = np.stack([turn.real, turn.imag, np.broadcast_to(point[:, 2], turn.shape)], axis=-1) - lever
+        moments = np.einsum("nik,nij,hnj->hnk", flat, across, to, optimize=True)
+        ahead, weight = to, np.ones(turn.shape)
         for _ in range(2):
-            shift = np.linalg.lstsq((across[:, :, :2] / far).reshape(-1, 2), (b / far).ravel())[0]
-            ahead = to - [*shift, 0.0]
-            far = np.maximum(np.linalg.norm(ahead, axis=-1), 0.1)[:, None, None]
-        return misfit(unit, ahead), heading, np.exp(1j * heading) * complex(*shift)
+            information = np.einsum("hn,nkl->hkl", weight, squares) + 1e-9 * np.eye(2)
+            shift = np.linalg.solve(information, np.einsum("hn,hnk->hk", weight, moments)[..., None])[..., 0]
+            ahead = to - np.append(shift, np.zeros((len(shift), 1)), axis=1)[:, None]
+            weight = np.maximum(np.linalg.norm(ahead, axis=-1), 0.1) ** -2
+        missed = misfits(unit, ahead)
+        best = int(np.argmin(missed))
+        place = np.exp(1j * headings[best]) * complex(*shift[best])
+        return float(missed[best]), float(headings[best]), place
 
-    tried: NDArray[Any] = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
+    tried: Array = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
+    found = fitted(tried)
     for step in (0.02, 0.004):
-        tried = min(map(fitted, tried), key=itemgetter(0))[1] + step * np.arange(-5, 6)
-    return min(map(fitted, tried), key=itemgetter(0))
+        found = fitted(found[1] + step * np.arange(-5, 6))
+    return found
 
 
 class System(NamedTuple):
@@ -489,10 +497,10 @@ def _flat(parts: tuple[Array, Array, Array]) -> Array:
     return np.concatenate([part.ravel() for part in parts])
 
 
-def misfit(unit: Array, to: Array) -> float:
-    """Return the mean of (2 sin(angle / 2))^2, up to 0.04, between unit vectors and vectors (n, 3)."""
+def misfits(unit: Array, to: Array) -> Array:
+    """Return means (...) of (2 sin(angle / 2))^2, up to 0.04, between unit vectors (n, 3) and vectors (..., n, 3)."""
     cosine = (to * unit).sum(axis=-1) / np.maximum(np.linalg.norm(to, axis=-1), 1e-9)
-    return float(np.minimum(2.0 - 2.0 * cosine, 0.04).mean())
+    return np.asarray(np.minimum(2.0 - 2.0 * cosine, 0.04).mean(axis=-1))
 
 
 def deviation(rows: Array) -> float:

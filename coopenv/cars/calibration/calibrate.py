@@ -79,7 +79,10 @@ class Calibrated:
 
 
 INTRINSICS = ("focal length", "principal point", "lens distortion")
-TOGETHER = (("camera orientation", "camera position"), INTRINSICS[:2], INTRINSICS)
+TOGETHER = (
+    *(("camera orientation", "camera position"), ("camera orientation", "lens distortion")),
+    *(INTRINSICS[:2], INTRINSICS),
+)
 """Parts of a car that may be wrong at the same time."""
 
 

@@ -24,6 +24,7 @@ from coopenv.cars.doctor.sight import BAD, REMOVED
 from coopenv.cars.doctor.streams import CarStreams, Streams
 from coopenv.cars.messages.vision import rays
 
+ROUNDS = 3  # times that a cause is looked for without motion capture
 TRIED = 2  # hypotheses that are fitted in a round
 GAIN = 5.0
 """Gain of the linearised cost from which a hypothesis is fitted: a third of the gain that calibration accepts."""
@@ -43,17 +44,14 @@ def of_constants(streams: Streams, car: CarStreams) -> Iterator[Finding]:
             return
         batch = Batch(drive, True)
         blind = not any(batch.truth)
-        for i, j in exchanged(batch) if blind else ():
-            text = f"markers {drive.landmarks[i]} and {drive.landmarks[j]} are exchanged"
-            yield Finding("markers", text, treatment=Treatment.REFUSED, car=name)
-        if blind and (found := _coarse(drive, name, BAD)):
-            yield found
-            return
+        for finding, changed in _coarse(drive, name) if blind else ():
+            drive, batch = changed, Batch(changed, True)
+            yield finding
         given = batch.fit(batch.begin())
         fit = corrected(batch, given, TRIED, GAIN)
         if lines := [*unexplained(batch, fit)]:
-            cause = _coarse(drive, name, 0.0) if blind else None
-            yield cause or Finding(name, lines[0].partition(": ")[2], car=name, explained=False)
+            cause = next(_coarse(drive, name, 0.0), None) if blind else None
+            yield cause[0] if cause else Finding(name, lines[0].partition(": ")[2], car=name, explained=False)
             return
         yield from _wrong(batch, fit, name)
     except (DataError, np.linalg.LinAlgError):  # too short a drive, or one that determines no pose
@@ -89,19 +87,30 @@ def _wrong(batch: Batch, fit: Fit, name: str) -> Iterator[Finding]:
             yield Finding(title, text, float(fit.x[worst]), float(error[worst]), key, car=name)
 
 
-def _coarse(drive: CalibrationDrive, name: str, bad: float) -> Finding | None:
-    """Return the cause of a misfit above `bad` without motion capture; None: there is no such misfit, or no cause."""
-    (car,) = drive.cars
-    if (given := _windows(drive, car)) < bad:
-        return None
-    best, text = min((_windows(drive, changed, places), text) for text, changed, places in _changes(drive, car))
-    return Finding(name, text, treatment=Treatment.REFUSED, car=name) if best < REMOVED * given else None
+def _coarse(drive: CalibrationDrive, name: str, bad: float = BAD) -> Iterator[tuple[Finding, CalibrationDrive]]:
+    """Yield causes of misfits above `bad` without motion capture, and the drive without each and those before."""
+    for _ in range(ROUNDS):
+        (car,), batch = drive.cars, Batch(replace(drive, places=drive.places.copy()), False)
+        if (given := _windows(drive)) < bad:
+            return
+        if pairs := exchanged(batch):
+            for i, j in pairs:
+                text = f"markers {drive.landmarks[i]} and {drive.landmarks[j]} are exchanged"
+                about = Finding("markers", text, treatment=Treatment.REFUSED, car=name)
+                drive = replace(drive, places=batch.places)
+                yield about, drive
+            continue
+        tried = [(replace(drive, cars=(car,), places=places), text) for text, car, places in _changes(drive, car)]
+        least, n = min((_windows(changed), n) for n, (changed, _) in enumerate(tried))
+        if least > REMOVED * given:
+            return
+        drive, text = tried[n]
+        yield Finding(name, text, treatment=Treatment.REFUSED, car=name), drive
 
 
-def _windows(drive: CalibrationDrive, car: CarDrive, places: np.ndarray | None = None) -> float:
+def _windows(drive: CalibrationDrive) -> float:
     """Return the mean misfit of bearings in windows of dead reckoning."""
-    batch = Batch(replace(drive, cars=(car,), places=drive.places if places is None else places), False)
-    return batch.resected(0, np.arange(len(drive.places)))[1]
+    return Batch(drive, False).resected(0, np.arange(len(drive.places)))[1]
 
 
 def _changes(drive: CalibrationDrive, car: CarDrive) -> Iterator[tuple[str, CarDrive, np.ndarray]]:
@@ -122,7 +131,8 @@ def _changes(drive: CalibrationDrive, car: CarDrive) -> Iterator[tuple[str, CarD
             right = replace(lens, focal_length=(fx, fy), principal_point=(cx, cy), image_size=(100_000, 100_000))
             ray, there = rays(car.pixel, right)
             names = ("time", "target", "pixel")
-            seen: dict[str, Any] = {name: getattr(car, name)[there] for name in names} | {"ray": ray[there]}
+            seen: dict[str, Any] = {name: getattr(car, name)[there] for name in names}
+            seen |= {"ray": ray[there], "lens": right}
             yield f"its focal length is {1.0 / factor:g} times that of its images", replace(car, **seen), places
     for what, signs in (("x", [-1.0, 1.0, 1.0]), ("y", [1.0, -1.0, 1.0])):
         yield f"the map is mirrored: {what} has the other sign", car, places * signs

@@ -16,7 +16,7 @@ from coopenv.cars.doctor.constants import of_constants
 from coopenv.cars.doctor.finding import Diagnosis, Finding, Treatment
 from coopenv.cars.doctor.motion import of_frozen_streams, of_turning, of_velocity, turns_contradict
 from coopenv.cars.doctor.sight import of_sight
-from coopenv.cars.doctor.streams import TURNING, CarStreams, Streams
+from coopenv.cars.doctor.streams import MOVING, TURNING, CarStreams, Streams
 from coopenv.cars.doctor.turning import constant_turn_rate
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist
 from coopenv.cars.settings.profile import Role
@@ -107,7 +107,7 @@ def changed(car: CarStreams, diagnoses: Iterable[Diagnosis]) -> CarStreams:
 def _unnamed(car: CarStreams, named: Sequence[Diagnosis]) -> Iterator[list[Diagnosis]]:
     """Yield what each check finds, but for what is named already, in the order in which faults hide each other."""
     known = {_words(each.finding) for each in named}
-    for check in (_of_constant_turning, of_frozen_streams, of_sight, _of_motion):
+    for check in (_of_unmeasured, _of_constant_turning, of_frozen_streams, of_sight, _of_motion):
         if new := [each for each in check(car) if _words(each.finding) not in known]:
             yield new
 
@@ -115,6 +115,15 @@ def _unnamed(car: CarStreams, named: Sequence[Diagnosis]) -> Iterator[list[Diagn
 def _words(finding: Finding) -> tuple[str, str]:
     """Return the subject and the text of a finding without its numbers."""
     return finding.subject, re.sub(r"[-\d.()]+", "", finding.text.partition(":")[0])
+
+
+def _of_unmeasured(car: CarStreams) -> Iterator[Diagnosis]:
+    for what, kind, roles in (("velocity", "wheel", MOVING), ("turn rate", "gyro", TURNING)):
+        role = next((role for role in roles if role in car.topics), None)
+        if role is not None and not len(car.tracks[kind]) and (n := sum(s.role is role for s in car.samples)):
+            text = f"the {what} of {car.name} is measured in none of {n} messages: variances of -1, or NaN"
+            about = Finding(car.topics[role], text, treatment=Treatment.REFUSED, car=car.name)
+            yield Diagnosis(about)
 
 
 def _of_constant_turning(car: CarStreams) -> Iterator[Diagnosis]:

@@ -46,6 +46,8 @@ FOLLOWS = 0.6
 """Share of the variance that a right stream explains at least; noise takes under 0.1 at `TURNS` and `MOVES`."""
 SURE, LAGS = 0.9, (*np.arange(-1.0, 0.0, 0.1), *np.arange(0.1, 1.05, 0.1))
 """Share of the variance from which no other lag is tried, and lags, s."""
+IN_THE_ROOM = "is in the frame of"
+"""Words of a velocity that is not in the body's frame."""
 LEAST = 0.05
 """Practical size: a scale by which 20 s of driving at 0.3 m/s are 0.3 m off without bearings."""
 
@@ -240,7 +242,7 @@ def _in_the_room(
     angle = math.degrees(float(np.angle(room.factor)))
     turned = f", turned by {angle:.0f} deg" if abs(angle) > 3.0 else ""
     text = (
-        f"the velocity of {car.name} is in the frame of {what}{turned}, and not in the car's: "
+        f"the velocity of {car.name} {IN_THE_ROOM} {what}{turned}, and not in the car's: "
         f"{with_error(abs(room.factor), room.error)} times the motion there, {room.explained:.0%} explained"
     )
     treatment = Treatment.MENDED if own and not turned else Treatment.REFUSED

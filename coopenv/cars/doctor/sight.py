@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coopenv.cars.bags.clocks import CAMERAS
-from coopenv.cars.calibration.batch import misfit, seen_from
+from coopenv.cars.calibration.batch import misfits, seen_from
 from coopenv.cars.calibration.calibrate import INTRINSICS
 from coopenv.cars.doctor.finding import Change, Diagnosis, Finding, Treatment, with_error
 from coopenv.cars.doctor.streams import CarStreams, Planar
@@ -55,7 +55,7 @@ class PosedSightings:
 
     def misfit(self) -> float:
         """Return the mean of (2 sin(angle / 2))^2 up to 0.04 between rays and markers."""
-        return misfit(self.ray, self.ahead)
+        return float(misfits(self.ray, self.ahead))
 
 
 def thinned(car: CarStreams) -> CarStreams | None:

@@ -323,7 +323,7 @@ def test_a_velocity_that_sticks_after_a_stand_is_found() -> None:
     wheel[(t > 28.0) & (t < 36.0)] = 0.0
     tracks = {"truth_time": t, "truth": place, "truth_yaw": 0.0 * t, "wheel_time": t, "wheel": wheel + 0j}
     car: Any = SimpleNamespace(name="car", tracks=tracks | {"gyro_time": t, "gyro": t}, topic=lambda roles: "/wheels")
-    [found] = [f for f in of_frozen_streams(car) if "velocity" in f.text]
+    [found] = [each.finding for each in of_frozen_streams(car) if "velocity" in each.finding.text]
     assert "in a row for 8.0 s" in found.text and "2.37 m" in found.text
 
 
