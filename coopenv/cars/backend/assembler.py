@@ -24,6 +24,7 @@ from coopenv.cars.bags.clocks import NEAR, OUTLYING, Delay, checked, jumps, outl
 from coopenv.cars.gate.gate import MOST_AHEAD
 from coopenv.cars.link.transport import Arrival, Transport
 from coopenv.cars.messages.codec import decode, stamp_of
+from coopenv.cars.messages.detectors import PLACED
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist, Value, read
 from coopenv.cars.messages.stated import stated
 from coopenv.cars.messages.vision import Calibration
@@ -307,6 +308,13 @@ class Intake:
         }
         """Car, role and camera of the topics that are read, by name."""
         self.clocks = {topic: TopicClock() for topic, (name, _, _) in self.topics.items() if name in binding.cars}
+
+    @property
+    def lenses(self) -> dict[str, Calibration]:
+        """Calibrations by whose pixels the rays of cars are made."""
+        role = Role(self._sensors.detections)
+        pixels = self._profile.topics[role].type not in PLACED and (role is Role.DETECTIONS or self._sensors.distorted)
+        return self.calibrations if pixels else {}
 
     def samples(self, arrival: Arrival) -> Iterator[Sample]:
         """Yield the sample of a message, or none if the message is malformed."""

@@ -17,7 +17,7 @@ from coopenv.cars.backend.buffers import ROLES, StatusBoard
 from coopenv.cars.backend.recorded_drive import PRESENCE, DriveRecorder, RecordedTransport, head_of
 from coopenv.cars.backend.station import UNTRIED, Gates, Pacer, Station
 from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog, bearing_nis, since
-from coopenv.cars.doctor.finding import Finding
+from coopenv.cars.doctor.finding import Finding, Treatment
 from coopenv.cars.doctor.live import StreamMonitor, examined
 from coopenv.cars.gate.wheel_command import MotionCommand
 from coopenv.cars.link.connect import open_transport
@@ -103,7 +103,7 @@ class Svea:
         self.gates = Gates(transport, cars, deployment.limits, signer, verifier, profile, zenoh)
         self.board = StatusBoard(transport, cars, deployment.remote, deployment.conditions, profile)
         self.monitor = LinkMonitor(deployment.safety.judge)
-        self._streams = StreamMonitor(binding, deployment.sensors.trust)
+        self._streams = StreamMonitor(binding, deployment.sensors.trust, self.intake.lenses)
         self.watchdog = Watchdog(
             *(deployment.safety, self.station, self.gates, self.monitor, cars, others, self._odometry),
             *(1.0 / self.scenario.rates.decision, self.board.happened, self._write_down),
@@ -161,6 +161,8 @@ class Svea:
         Raises:
             CoopenvError: a condition of arming does not hold.
         """
+        for finding in self._streams.constants():
+            warnings.warn(str(finding), DataWarning, stacklevel=2)
         self._clock.wait(lambda: self._obstacle() is None, READY_TIME)
         if found := self._obstacle():
             raise CoopenvError(f"not armed: {found}")
@@ -193,7 +195,8 @@ class Svea:
             yield from ((car, why) for why in own)
             if why := self._streams.contradiction(car):
                 yield car, f"its turn rate {why}"
-            yield from ((car, str(finding)) for finding in self._streams.findings() if finding.car == car)
+            found = [finding for finding in self._streams.findings() if finding.car == car]
+            yield from ((car, str(finding)) for finding in found if finding.treatment is Treatment.REFUSED)
         if safety.judge == "truth":  # estimates are not known before cars drive
             yield from self.watchdog.misplaced()
 
@@ -418,7 +421,8 @@ def examined_arrivals(arrivals: Sequence[Arrival], fleet: Deployment) -> list[Fi
     binding = bind(scenario, fleet.cars, fleet.markers, fleet.file.name, None, fleet.profile)
     intake = Intake(binding, fleet.sensors)
     samples = [sample for arrival in arrivals for sample in intake.samples(arrival)]
-    found = examined(sorted(samples, key=lambda sample: sample.stamp), binding, fleet.sensors.trust)
+    samples.sort(key=lambda sample: sample.stamp)
+    found = examined(samples, binding, fleet.sensors.trust, intake.lenses, constants=True)
     return [finding for some in found.values() for finding in some]
 
 

@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import compress, groupby
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import COMMANDS, TRUTH, UNNEEDED, Chosen, ClockSettings, MapFrame, TopicMap, select
 from coopenv.cars.bags.topics import NS, TopicRow, regularity
 from coopenv.cars.bags.transforms import StaticTree, odd_mountings, unread_truth
+from coopenv.cars.calibration.drives import drive_of_car
 from coopenv.cars.doctor.doctor import Examined, examine, examine_constants, treated
 from coopenv.cars.doctor.finding import Finding, Treatment, with_error
 from coopenv.cars.doctor.motion import IN_THE_ROOM
@@ -449,7 +451,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         added.setdefault((track.chosen.car, track.chosen.role), (topic, moved))
     rows = rows_of(files, chosen, samples, clocks, tracks, leads)
     streams = replace(streams, samples=samples, lenses=pixels, added=added)
-    constants = examine_constants(examined, streams, trusted)
+    constants = examine_constants(examined, partial(drive_of_car, streams), trusted)
     timing = [*_of_timing(tracks, samples, drifts, examined), *([common] if common else [])]
     findings = [*(treated(finding, trusted) for finding in timing), *examined.findings, *constants]
     stating = {car: about for car, (_, about) in published.items()}

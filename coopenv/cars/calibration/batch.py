@@ -449,7 +449,7 @@ def seen_from(unit: Array, lever: Array, point: Array) -> tuple[float, float, co
     flat = across[:, :, :2]
     squares = np.einsum("nik,nil->nkl", flat, flat)
 
-    def fitted(headings: Array) -> tuple[float, float, complex]:
+    def fitted(headings: NDArray[Any]) -> tuple[float, float, complex]:
         turn = np.exp(-1j * headings)[:, None] * (point[:, 0] + 1j * point[:, 1])
         to = np.stack([turn.real, turn.imag, np.broadcast_to(point[:, 2], turn.shape)], axis=-1) - lever
         moments = np.einsum("nik,nij,hnj->hnk", flat, across, to, optimize=True)
@@ -464,10 +464,11 @@ def seen_from(unit: Array, lever: Array, point: Array) -> tuple[float, float, co
         place = np.exp(1j * headings[best]) * complex(*shift[best])
         return float(missed[best]), float(headings[best]), place
 
-    tried: Array = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
+    tried: NDArray[Any] = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
     found = fitted(tried)
     for step in (0.02, 0.004):
-        found = fitted(found[1] + step * np.arange(-5, 6))
+        tried = found[1] + step * np.arange(-5, 6)
+        found = fitted(tried)
     return found
 
 

@@ -1,6 +1,7 @@
 """Input of a calibration from a drive: image points, odometry and motion capture of each car, from bags and logs."""
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -77,19 +78,25 @@ def averaged(values: NDArray[Any], period: float) -> Any:
     return uniform_filter1d(values, max(1, round(SMOOTH / period)), mode="nearest")
 
 
-def car_of(
-    scenario: Scenario, name: str, vehicle: int, lens: Calibration | None, ray: Array, where: str, **measured: Any
-) -> CarDrive:
-    """Return a car with the sightings that are of use.
+def car_of(car: CarStreams, where: str, **more: Any) -> CarDrive:
+    """Return the sightings of a car that are of use, its other streams, and what else is known of it.
 
     Left out are those at the rim of the image, where a marker is cut off, and of each landmark all but the first within
     a step of the motion: while a car stands, pixels repeat the same rounding. Raises DataError: too few sightings.
     """
-    camera, start = scenario.cameras[vehicle], scenario.vehicles[vehicle].initial_pose
-    pixel = np.zeros((len(ray), 2)) if lens is None else np.round(lens.pixels(ray), 3)
-    place: dict[str, Any] = {"mounting": camera.to_body(), "lever": np.array(camera.position), "pixel": pixel}
-    place["height"] = start.position[2] if start is not None and start.position is not None else 0.0
-    car = CarDrive(name=name, vehicle=vehicle, lens=lens, ray=ray, **(place | measured))
+    pixel = np.zeros((len(car.ray), 2)) if car.lens is None else np.round(car.lens.pixels(car.ray), 3)
+    tracks = {key: value for key, value in car.tracks.items() if "command" not in key}
+    same = {key: getattr(car, key) for key in SAME}
+    return _of_use(CarDrive(pixel=pixel, **tracks, **same, **more), where)
+
+
+SAME = ("name", "vehicle", "mounting", "lever", "height", "lens", "time", "target", "ray")
+"""Fields that a drive takes over."""
+
+
+def _of_use(car: CarDrive, where: str) -> CarDrive:
+    """Return a car without sightings that are of no use. Raises DataError: too few are left."""
+    name, lens, ray, pixel = car.name, car.lens, car.ray, car.pixel
     rows = np.arange(len(ray))
     if lens is not None:
         rows = np.flatnonzero(((pixel > 1.5) & (pixel < np.array(lens.image_size) - 2.5)).all(axis=-1))
@@ -121,15 +128,17 @@ def drive_of_streams(streams: Streams, where: str, chosen: Sequence[CarStreams] 
     return CalibrationDrive(cars, streamed[0].names, streamed[0].places, streams.binding.scenario)
 
 
+def drive_of_car(streams: Streams, car: CarStreams) -> CalibrationDrive:
+    """Return the drive of a car alone, as `drive_of_streams` does."""
+    return drive_of_streams(streams, car.name, [car])
+
+
 def _of_car(streams: Streams, car: CarStreams, where: str) -> CarDrive:
     added, name = streams.added, car.name
     topics = [next((added[name, role] for role in roles if (name, role) in added), ("", 0.0)) for roles in ROLES]
     right = streams.corrections.get(name, Correction())
-    tracks = {key: value for key, value in car.tracks.items() if "command" not in key}
-    found = {"time": car.time, "target": car.target, "topics": tuple(topics[:3]), "gyro_added": topics[3][1], **tracks}
-    found["height"] = car.height
-    found |= {"corrected": (right.wheel_scale, right.gyro_bias), "mounting": car.mounting, "lever": car.lever}
-    return car_of(streams.binding.scenario, name, car.vehicle, car.lens, car.ray, where, **found)
+    known = {"topics": tuple(topics[:3]), "gyro_added": topics[3][1]}
+    return car_of(car, where, corrected=(right.wheel_scale, right.gyro_bias), **known)
 
 
 def drive_of_recording(recording: "Recording", path: Path) -> CalibrationDrive:
@@ -137,34 +146,68 @@ def drive_of_recording(recording: "Recording", path: Path) -> CalibrationDrive:
     r = recording
     if r.scenario is None or r.pan is not None:
         raise DataError(f"{path}: calibrate needs a log with its environment and with cameras that do not turn")
-    static = np.flatnonzero(np.ptp(r.landmarks, axis=0).max(axis=-1, initial=0.0) < 1e-9)
-    names = tuple(r.setups[0].target_names[i] for i in static)
-    return CalibrationDrive(tuple(_of_vehicles(r, r.scenario, static, path)), names, r.landmarks[0, static], r.scenario)
+    streamed = streams_of_recording(r)
+    for car in streamed:
+        climb = abs(float(r.translation[1:, car.vehicle, 2].mean())) / r.dt
+        if climb > CLIMB or np.abs(car.turning[:, :2].mean(axis=0)).max() > TILT:
+            raise DataError(f"{path}: {car.name} leaves the plane; calibrate is for cars")
+    cars = tuple(car_of(car, str(path)) for car in streamed)
+    return CalibrationDrive(cars, streamed[0].names, streamed[0].places, r.scenario)
 
 
-def _of_vehicles(r: "Recording", scenario: Scenario, static: NDArray[np.int64], path: Path) -> Iterator[CarDrive]:
-    for i, setup in enumerate(r.setups):
-        turn, speed = np.array([log_so3(R) for R in r.rotation[1:, i]]) / r.dt, r.translation[1:, i] / r.dt
-        if abs(float(speed[:, 2].mean())) > CLIMB or np.abs(turn[:, :2].mean(axis=0)).max() > TILT:
-            raise DataError(f"{path}: {setup.name} leaves the plane; calibrate is for cars")
-        camera, middle = scenario.cameras[i], r.t[1:] - 0.5 * r.dt
-        tick, target = np.nonzero(r.visible[:, i, static])
-        ray = r.bearings[tick, i, static[target]] @ camera.to_body()
-        lens = Calibration.of(camera) if camera.model == "pinhole" else None
-        if lens is not None and not camera.undistort:  # bearings of pixels whose distortion was left in
-            ray = rays(replace(lens, distortion=(0.0,) * 5).pixels(ray), lens)[0]
-        known = np.flatnonzero(r.truth.known[:, i])
-        place = r.truth.position[known, i]
-        found = {
-            "time": r.t[tick] - r.filled("bearing_age")[tick, i],
-            "target": target,
-            "wheel_time": middle,
-            "wheel": (speed[:, 0] + 1j * speed[:, 1]) * np.exp(-0.5j * turn[:, 2] * r.dt),
-            "gyro_time": middle,
-            "gyro": turn[:, 2],
-            "truth_time": r.t[known],
-            "truth": place[:, 0] + 1j * place[:, 1],
-            "truth_yaw": np.array([yaw_of(R) for R in r.truth.rotation[known, i]]),
-            **({"height": float(np.median(place[:, 2]))} if len(place) else {}),
-        }
-        yield car_of(scenario, setup.name, i, lens, ray, str(path), **found)
+def streams_of_recording(recording: "Recording") -> list[CarStreams]:
+    """Return the streams of the vehicles of a recording, whose cameras do not turn.
+
+    Without an environment, rays are those of the body frame.
+    """
+    static = np.flatnonzero(np.ptp(recording.landmarks, axis=0).max(axis=-1, initial=0.0) < 1e-9)
+    return [_of_vehicle(recording, i, static) for i in range(len(recording.setups))]
+
+
+def _of_vehicle(r: "Recording", i: int, static: NDArray[np.int64]) -> CarStreams:
+    setup, scenario, middle = r.setups[i], r.scenario, r.t[1:] - 0.5 * r.dt
+    camera = None if scenario is None else scenario.cameras[i]
+    mounting = np.eye(3) if camera is None else camera.to_body()
+    turn, speed = np.array([log_so3(R) for R in r.rotation[1:, i]]) / r.dt, r.translation[1:, i] / r.dt
+    tick, target = np.nonzero(r.visible[:, i, static])
+    ray = r.bearings[tick, i, static[target]] @ mounting
+    lens = Calibration.of(camera) if camera is not None and camera.model == "pinhole" else None
+    if lens is not None and camera is not None and not camera.undistort:  # bearings with the lens's distortion
+        ray = rays(replace(lens, distortion=(0.0,) * 5).pixels(ray), lens)[0]
+    known, none = np.flatnonzero(r.truth.known[:, i]), np.zeros(0)
+    place = r.truth.position[known, i]
+    tracks = {
+        "wheel_time": middle,
+        "wheel": (speed[:, 0] + 1j * speed[:, 1]) * np.exp(-0.5j * turn[:, 2] * r.dt),
+        "gyro_time": middle,
+        "gyro": turn[:, 2],
+        "truth_time": r.t[known],
+        "truth": place[:, 0] + 1j * place[:, 1],
+        "truth_yaw": np.array([yaw_of(R) for R in r.truth.rotation[known, i]]),
+        **dict.fromkeys(("command_time", "command_speed", "command_steering"), none),
+    }
+    start = None if scenario is None else scenario.vehicles[i].initial_pose
+    height = start.position[2] if start is not None and start.position is not None else 0.0
+    return CarStreams(
+        name=setup.name,
+        vehicle=i,
+        topics={role: f"/{setup.name}/{role.value}" for role in (Role.DETECTIONS, Role.ODOMETRY, Role.TRUTH)},
+        samples=(),
+        tracks=tracks,
+        turning=turn,
+        pose_time=none,
+        pose=none.astype(np.complex128),
+        pose_yaw=none,
+        time=r.t[tick] - r.filled("bearing_age")[tick, i],
+        target=target,
+        ray=ray,
+        lens=lens,
+        mounting=mounting,
+        lever=np.array(setup.lever_arm),
+        height=float(np.median(place[:, 2])) if len(place) else height,
+        places=r.landmarks[0, static],
+        names=tuple(setup.target_names[n] for n in static),
+        numbers={},
+        wheelbase=math.inf if scenario is None else scenario.limits[i].wheelbase,
+        scale_noise=setup.noise.odometry_scale,
+    )

@@ -1,7 +1,7 @@
 """Checks of constants by the least squares of `coopenv calibrate`, of which a score test finds those worth a fit."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -17,11 +17,10 @@ from coopenv.cars.calibration.calibrate import (
     unexplained,
     wrong,
 )
-from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive, drive_of_streams
+from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive
 from coopenv.cars.doctor.finding import Finding, Treatment
 from coopenv.cars.doctor.motion import SPEED_FACTORS
 from coopenv.cars.doctor.sight import BAD, REMOVED
-from coopenv.cars.doctor.streams import CarStreams, Streams
 from coopenv.cars.messages.vision import rays
 
 ROUNDS = 3  # times that a cause is looked for without motion capture
@@ -34,12 +33,12 @@ COARSE = 2.0
 """Times the deviation that counts as wrong in a calibration, below which constants are no finding here."""
 
 
-def of_constants(streams: Streams, car: CarStreams) -> Iterator[Finding]:
-    """Yield wrong constants of a car: camera, wheels, gyro, clocks and markers."""
-    name = car.name
+def of_constants(drive_of: Callable[[], CalibrationDrive]) -> Iterator[Finding]:
+    """Yield wrong constants of the car of a drive, and of its markers: camera, wheels, gyro, clocks."""
     try:
-        drive = drive_of_streams(streams, name, [car])
+        drive = drive_of()
         drive = replace(drive, cars=(thinned(drive.cars[0]),))
+        name = drive.cars[0].name
         if len(drive.places) < 2 or not np.ptp(drive.places, axis=0).any():
             return
         batch = Batch(drive, True)

@@ -8,10 +8,12 @@ backward elimination of regressors does. Source: Draper and Smith, Applied Regre
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from coopenv.cars.bags.clocks import CAMERAS
+from coopenv.cars.calibration.drives import CalibrationDrive
 from coopenv.cars.doctor.constants import of_constants
 from coopenv.cars.doctor.finding import Diagnosis, Finding, Treatment
 from coopenv.cars.doctor.motion import of_frozen_streams, of_turning, of_velocity, turns_contradict
@@ -56,19 +58,25 @@ def treated(finding: Finding, trusted: Collection[str]) -> Finding:
     return replace(finding, treatment=Treatment.TRUSTED) if {finding.subject, "all"} & {*trusted} else finding
 
 
-def examine(streams: Streams, trusted: Collection[str] = ()) -> Examined:
+def examine(
+    streams: Streams, trusted: Collection[str] = (), counts: Callable[[CarStreams], bool] = lambda car: True
+) -> Examined:
     """Return what is wrong with the streams of all cars, but for constants and clocks.
 
     Args:
         streams: of a bag or of live cars.
         trusted: topics, or other subjects of findings, that stay unchanged.
+        counts: whether a car is looked at.
     """
+    cars = (streams.car(name) for name in streams.binding.cars)
+    return examine_cars([car for car in cars if car.samples and counts(car)], trusted)
+
+
+def examine_cars(cars: Iterable[CarStreams], trusted: Collection[str] = ()) -> Examined:
+    """Return what is wrong with the streams of cars, as `examine` does."""
     found = Examined()
-    for name in streams.binding.cars:
-        car = streams.car(name)
-        if not car.samples:
-            continue
-        diagnoses = diagnosed(car)
+    for car in cars:
+        name, diagnoses = car.name, diagnosed(car)
         found.cars[name] = changed(car, diagnoses)
         for each in diagnoses:
             mend, finding = _mend_of(each.finding, car), treated(each.finding, trusted)
@@ -168,18 +176,20 @@ def _mend_of(finding: Finding, car: CarStreams) -> Mend:
     return mend
 
 
-def examine_constants(found: Examined, streams: Streams, trusted: Collection[str] = ()) -> list[Finding]:
+def examine_constants(
+    found: Examined, drive_of: Callable[[CarStreams], CalibrationDrive], trusted: Collection[str] = ()
+) -> list[Finding]:
     """Return wrong constants of all cars; of cars with a fault that nothing removes they are not looked at.
 
     Args:
         found: the examination of the cars, whose streams are without the faults that are known.
-        streams: of a bag.
+        drive_of: returns the drive of a car alone.
         trusted: subjects of findings that stay unchanged.
     """
     constants: list[Finding] = []
     for name, car in found.cars.items():
         if name not in found.spoilt:
-            new = (finding for finding in of_constants(streams, car) if finding.subject not in found.parts)
+            new = (each for each in of_constants(partial(drive_of, car)) if each.subject not in found.parts)
             constants += [treated(finding, trusted) for finding in new]
     return [*dict.fromkeys(constants)]
 

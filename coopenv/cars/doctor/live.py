@@ -1,17 +1,21 @@
 """The gate for live cars: the same checks, on a window of the last samples."""
 
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from coopenv.cars.backend.binding import Binding
-from coopenv.cars.doctor.doctor import examine
+from coopenv.cars.calibration.drives import drive_of_car
+from coopenv.cars.doctor.doctor import REMOVED, examine, examine_constants
 from coopenv.cars.doctor.finding import Finding, Treatment
-from coopenv.cars.doctor.streams import Streams
+from coopenv.cars.doctor.streams import CarStreams, Streams
 from coopenv.cars.doctor.turning import constant_turn_rate
 from coopenv.cars.messages.readings import Sample, Twist
+from coopenv.cars.messages.vision import Calibration
+from coopenv.cars.settings.profile import Role
 
 KEPT = 6_000  # samples of a car, some 20 s
 MOVED = 0.3  # m
@@ -24,12 +28,15 @@ class StreamMonitor:
     A finding stands until its car has moved without it.
     """
 
-    def __init__(self, binding: Binding, trusted: Collection[str] = ()) -> None:
-        """Begin without samples; `trusted` are subjects of findings that do not count."""
-        self._binding, self._trusted = binding, trusted
+    def __init__(
+        self, binding: Binding, trusted: Collection[str] = (), lenses: Mapping[str, Calibration] | None = None
+    ) -> None:
+        """Begin without samples; `trusted` are subjects of findings that do not count, `lenses` those of cameras."""
+        self._binding, self._trusted, self._lenses = binding, trusted, lenses or {}
         self._kept = {car: deque[Sample](maxlen=KEPT) for car in binding.cars}
         self._rates: dict[str, float] = {}
         self._turning: set[str] = set()
+        self._constant: dict[str, str] = {}  # last contradictions, which stand until a turn rate changes
         self._looked = 0
         self._found: dict[str, list[Finding]] = {}
 
@@ -54,41 +61,63 @@ class StreamMonitor:
         if car in self._turning:
             return None
         streams = Streams([*self._kept[car]], self._binding, {}).car(car)
-        return constant_turn_rate(streams.tracks, streams.sightings_in_plane, streams.wheelbase)
+        if why := constant_turn_rate(streams.tracks, streams.sightings_in_plane, streams.wheelbase):
+            self._constant[car] = why
+        return self._constant.get(car)
 
     def findings(self) -> list[Finding]:
         """Return the streams that others contradict; a result holds for a second of the samples."""
-        samples = sorted((s for kept in self._kept.values() for s in kept), key=lambda sample: sample.stamp)
+        samples = self._samples()
         now = max((sample.received for sample in samples), default=0)
         if now > self._looked + LASTS:
             self._looked = now
-            self._found |= examined(samples, self._binding, self._trusted)
+            self._found |= examined(samples, self._binding, self._trusted, self._lenses)
         return [finding for found in self._found.values() for finding in found]
 
+    def constants(self) -> list[Finding]:
+        """Return wrong constants of cars that have moved; the least squares take up to a second of CPU."""
+        found = examined(self._samples(), self._binding, self._trusted, self._lenses, constants=True)
+        return [finding for some in found.values() for finding in some if finding.treatment is Treatment.USED]
 
-def examined(samples: Sequence[Sample], binding: Binding, trusted: Collection[str] = ()) -> dict[str, list[Finding]]:
+    def _samples(self) -> list[Sample]:
+        return sorted((s for kept in self._kept.values() for s in kept), key=lambda sample: sample.stamp)
+
+
+def examined(
+    samples: Sequence[Sample],
+    binding: Binding,
+    trusted: Collection[str] = (),
+    lenses: Mapping[str, Calibration] | None = None,
+    *,
+    constants: bool = False,
+) -> dict[str, list[Finding]]:
     """Return, of live cars that have moved, the streams that others contradict by a known cause; nothing is mended.
 
-    Contradictions without a known cause are the watchdog's, which compares estimates. From one place many causes look
-    alike, so that cars that have stood are left out.
+    What a bag mends is refused here: gate and watchdog use the streams as they come. So is wrong motion capture, by
+    which the distances of cars are judged. Other findings stay warnings. Contradictions without a known cause are the
+    watchdog's, which compares estimates. From one place many causes look alike, so that cars that have stood are left
+    out.
 
     Args:
         samples: in the order of their stamps.
         binding: of the fleet.
         trusted: subjects of findings that do not count.
+        lenses: of the cameras of cars.
+        constants: whether wrong constants are looked for, too.
     """
     roles = {(s.car, s.role) for s in samples if s.role in binding.profile.topics}
     topics = {(car, role): binding.profile.topic_of(car, role) for car, role in roles}
-    streams = Streams(samples, binding, topics)
-    moved = [name for name in binding.cars if _moved(streams, name)]
-    if not moved:
-        return {}
-    found = examine(streams, trusted).findings
-    counted = [f for f in found if f.explained and f.treatment not in (Treatment.TRUSTED, Treatment.LEFT_OUT)]
-    return {car: [replace(f, treatment=Treatment.REFUSED) for f in counted if f.car == car] for car in moved}
+    streams = Streams(samples, binding, topics, lenses or {})
+    found = examine(streams, trusted, moved)
+    given = [*found.findings, *(examine_constants(found, partial(drive_of_car, streams), trusted) if constants else ())]
+    counted = [f for f in given if f.explained and f.treatment not in (Treatment.TRUSTED, Treatment.LEFT_OUT)]
+    truth = {topic for (_, role), topic in topics.items() if role is Role.TRUTH}
+    refused = [replace(f, treatment=Treatment.REFUSED) if f.subject in truth else f for f in counted]
+    refused = [replace(f, treatment=Treatment.REFUSED) if f.treatment in REMOVED else f for f in refused]
+    return {car: [f for f in refused if f.car == car] for car in found.cars}
 
 
-def _moved(streams: Streams, name: str) -> bool:
+def moved(car: CarStreams) -> bool:
     """Return whether a car has moved, by motion capture."""
-    place = streams.car(name).tracks["truth"]
+    place = car.tracks["truth"]
     return bool(np.abs(place - place[:1]).max(initial=0.0) > MOVED)

@@ -6,7 +6,7 @@ import re
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +15,7 @@ import pytest
 
 from coopenv.cars.backend.binding import Binding, bind
 from coopenv.cars.bags.clocks import SampledSignal
+from coopenv.cars.calibration.drives import drive_of_car
 from coopenv.cars.doctor.doctor import examine, examine_constants
 from coopenv.cars.doctor.finding import Treatment, with_error
 from coopenv.cars.doctor.live import StreamMonitor
@@ -182,7 +183,7 @@ def streams_of(change: Change | None, truth: bool = True, seed: int = 0, places:
 
 def findings_of(streams: Streams, trusted: tuple[str, ...] = ()) -> list[Any]:
     found = examine(streams, trusted)
-    return [*found.findings, *examine_constants(found, streams, trusted)]
+    return [*found.findings, *examine_constants(found, partial(drive_of_car, streams), trusted)]
 
 
 @pytest.mark.parametrize("name", FAULTS)
