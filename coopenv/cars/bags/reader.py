@@ -81,7 +81,7 @@ def _received(stream: BinaryIO) -> Generator[Record, None, bool]:
         if kind == END:
             return True
         data = stream.read(size) if size <= LARGEST else b""
-        if len(data) < size:
+        if len(data) < size or (kind in (BYTES, NOTHING) and number >= len(channels)):
             break
         if kind == CHANNEL:
             channels.append(BagChannel(*map(str, json.loads(data))))

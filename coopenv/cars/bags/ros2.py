@@ -1,14 +1,14 @@
 """Recordings as plain ROS 2 bags: standard messages in CDR alone, with the map by which coopenv reads the episode back.
 
 Topics of a vehicle: `detections` (each marker at a distance of 1 m along its bearing), `odometry` (dead reckoning, with
-the measured twist at a tick and a second one between ticks, which held give the increment), `imu` (the measured turn
-rate), `truth`, `estimate`, `camera_info`. Moving landmarks have `pose`, `/landmarks` shows all of them, and `/tf` has
-the truth or the estimate.
+twists that lead to the next tick, and the measured one between), `imu` (the measured turn rate), `truth`, `estimate`,
+`camera_info`. Moving landmarks have `pose`, `/landmarks` shows all of them, and `/tf` has the truth or the estimate.
 """
 
 import re
 import warnings
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,8 +34,12 @@ START = 1_577_836_800
 """s since 1970 of tick 0: 2020-01-01. A time of reception of 0 means that a clock was not set."""
 DISTANCE = 1.0  # m of markers, whose distance a camera does not measure
 FIRST_MARKER = 1
-MIDDLE = 0.6
-"""Share of the time between ticks after which the second twist holds; readers make a tick half a period after it."""
+BEFORE, AFTER, LATE = 0.45, 0.55, 0.95
+"""Shares of the time between ticks at which the measured twist begins, ends, and the twist after it comes again.
+
+Readers make a tick half a period after its frame, with the last twist before. Other twists lead to the next tick, also
+if a reader interpolates.
+"""
 SAME_PLACE = 1e-6  # m, of rounding
 MAP_FILE, ENVIRONMENT_FILE = "topics.toml", "environment.toml"
 STATIC = "/tf_static"
@@ -137,7 +141,8 @@ def messages_of(recording: Recording, estimates: Run | None) -> Iterator[Sent]:
             yield _sent(r, k, "/landmarks", _markers(_time(r, k), places))
         if moved := [found for vehicle in vehicles if (found := vehicle.transform(k)) is not None]:
             yield _sent(r, k, "/tf", make(TRANSFORMS[0], transforms=moved))
-        yield from (vehicle.between(k) for vehicle in vehicles if 0 <= k < r.ticks - 1)
+        between = (vehicle.between(k) for vehicle in vehicles if 0 <= k < r.ticks - 1)
+        yield from sorted((sent for some in between for sent in some), key=lambda sent: sent.time)
 
 
 def _time(recording: Recording, k: int) -> int:
@@ -180,7 +185,10 @@ class _Vehicle:
             self._reckoned = _moved(self._reckoned, (r.rotation[k, i], r.translation[k, i]))
         at = max(k, 0)
         linear, angular = r.velocity[at, i], r.angular_velocity[at, i]
-        yield "odometry", self._odometry(time, self._reckoned, linear, angular)
+        yield (
+            "odometry",
+            self._odometry(time, self._reckoned, *(self._leading(k) if 0 <= k < r.ticks - 1 else (linear, angular))),
+        )
         if k < 0:
             return
         body, absent = header(time, self.name), np.array([-1.0, *[0.0] * 8])
@@ -204,19 +212,33 @@ class _Vehicle:
         twist = {"twist": (tuple(linear), tuple(angular))}
         return make("nav_msgs/msg/Odometry", pose={"pose": pose(*reckoned)}, twist=twist, **about)
 
-    def between(self, k: int) -> Sent:
-        """Return the odometry between a tick and the next one: its twist leads to that, after the measured one."""
+    def between(self, k: int) -> Iterator[Sent]:
+        """Yield the odometry between a tick and the next one: the measured twist, and those that lead to the next."""
         r, i = self._recording, self._number
         begin, end = _time(r, k), _time(r, k + 1)
-        middle = begin + round(MIDDLE * (end - begin))
-        first, second = (middle - begin) * 1e-9, (end - middle) * 1e-9
-        w, v = r.angular_velocity[k, i] * first, r.velocity[k, i] * first
-        R, p = exp_so3(w), exp_translation(w, v)
+        times = [begin + round(share * (end - begin)) for share in (BEFORE, AFTER, LATE)]
+        before, measured, after = ((b - a) * 1e-9 for a, b in pairwise([begin, *times[:2], end]))
+        first, measuring = self._leading(k), (r.velocity[k, i], r.angular_velocity[k, i])
+        reached = _increment(*first, before)
+        yield self._between(times[0], reached, measuring)
+        reached = _moved(reached, _increment(*measuring, measured))
+        last = self._leading(k, reached, after)
+        yield self._between(times[1], reached, last)
+        yield self._between(times[2], _moved(reached, _increment(*last, (times[2] - times[1]) * 1e-9)), last)
+
+    def _between(self, time: int, reached: tuple[Array, Array], twist: tuple[Array, Array]) -> Sent:
+        """Return the odometry after an increment since the last tick."""
+        return Sent(time, f"/{self.name}/odometry", self._odometry(time, _moved(self._reckoned, reached), *twist))
+
+    def _leading(
+        self, k: int, reached: tuple[Array, Array] = (np.eye(3), np.zeros(3)), seconds: float | None = None
+    ) -> tuple[Array, Array]:
+        """Return velocity and turn rate that lead to the next tick within a time, from an increment after a tick."""
+        r, i, (R, p) = self._recording, self._number, reached
         turn = log_so3(R.T @ r.rotation[k + 1, i])
         along = np.column_stack([exp_translation(turn, axis) for axis in np.eye(3)])
         step = np.linalg.solve(along, R.T @ (r.translation[k + 1, i] - p))
-        message = self._odometry(middle, _moved(self._reckoned, (R, p)), step / second, turn / second)
-        return Sent(middle, f"/{self.name}/odometry", message)
+        return step / (seconds or r.dt), turn / (seconds or r.dt)
 
     def _estimate(self, k: int, estimates: Run) -> Any:
         R, p, P = (array[k, self._number] for array in (estimates.rotation, estimates.position, estimates.covariance))
@@ -235,6 +257,11 @@ class _Vehicle:
                 about = {"header": header(_time(r, k), "map"), "child_frame_id": self.name}
                 return make("geometry_msgs/msg/TransformStamped", transform=place, **about)
         return None
+
+
+def _increment(linear: Array, angular: Array, seconds: float) -> tuple[Array, Array]:
+    """Return rotation and translation by a twist."""
+    return exp_so3(angular * seconds), exp_translation(angular * seconds, linear * seconds)
 
 
 def _moved(pose: tuple[Array, Array], increment: tuple[Array, Array]) -> tuple[Array, Array]:

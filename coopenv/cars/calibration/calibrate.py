@@ -14,10 +14,9 @@ from math import log
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
-from coopenv.base.errors import DataError, listed
+from coopenv.base.errors import DataError
 from coopenv.cars.calibration.batch import (
     BIAS,
     CAMERA_TIME,
@@ -31,7 +30,7 @@ from coopenv.cars.calibration.batch import (
     standard_errors,
     stated_rate,
 )
-from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive
+from coopenv.cars.calibration.drives import CalibrationDrive
 from coopenv.estimation.lens import PLUMB_BOB
 from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import Mask
@@ -44,9 +43,6 @@ FINEST = {"deg": 0.0035, "m": 0.004, "px": 1.0, "": 0.01, "rad/s": 0.002, "s": 0
 """By unit (rad for deg), the least deviation that counts as wrong."""
 LARGEST_PIXEL, LARGEST_ANGLE, LARGEST_PLACE = 4.0, 0.02, 0.1
 """Standard deviations of residuals (pixels; rad without pixels; m of motion capture) above which nothing fits."""
-UNITS = {"deg/s": 57.3, "km/h": 3.6, "mm/s": 1000.0}
-"""Factors of units that are not those of messages."""
-MOVED = 2.0  # rad or m of motion capture, from which its rates are compared
 WITHIN = "within the environment's noise"
 TIGHT = {"marker": 0.01, "truth.frame": 0.01}
 """By the begin of a name, the prior (m, rad) in the estimate of all constants together: the map is surveyed."""
@@ -257,24 +253,8 @@ def unexplained(batch: Batch, fit: Fit) -> Iterator[str]:
         unit, most = ("rad", LARGEST_ANGLE) if car.lens is None else ("px", LARGEST_PIXEL)
         if seen > most or (truth and place > LARGEST_PLACE):
             off = f"{seen:.3g} {unit}" + (f" and {place:.3g} m of motion capture" if truth else "")
-            check = listed([*_odd_units(car), "check landmarks, markers, frames and clocks"])
+            check = "check landmarks, markers, frames, units and clocks (of a bag: coopenv doctor)"
             yield f"{car.name}: no constant explains the residuals ({off}): {check}"
-
-
-def _odd_units(car: CarDrive) -> Iterator[str]:
-    """Yield measured rates whose unit is not that of motion capture, and by what factor."""
-    if len(car.truth_time) < 2:
-        return
-    time = np.arange(car.truth_time[0], car.truth_time[-1], 0.5)
-    place, yaw = (np.interp(time, car.truth_time, v) for v in (car.truth, np.unwrap(car.truth_yaw)))
-    tracks = ("turn rates", car.gyro_time, car.gyro, yaw), ("speeds", car.wheel_time, np.abs(car.wheel), place)
-    for name, when, rate, true in tracks:
-        way = np.diff(np.interp(time, when, cumulative_trapezoid(rate, when, initial=0.0)))
-        step = np.diff(true) if name == "turn rates" else np.abs(np.diff(true))
-        factor = float(way @ step / max(float(step @ step), 1e-9))
-        if np.abs(step).sum() > MOVED and not 0.5 < factor < 2.0:
-            unit = next((f" ({unit}?)" for unit, k in UNITS.items() if abs(factor / k - 1.0) < 0.1), "")
-            yield f"its {name} are {factor:.3g} times those of motion capture{unit}"
 
 
 def _noise(batch: Batch, fit: Fit) -> dict[str, float]:

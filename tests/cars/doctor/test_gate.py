@@ -15,7 +15,6 @@ import coopenv
 from coopenv.base.errors import CoopenvError, DataError, DataWarning
 from coopenv.cars.bags.bag import Bag
 from coopenv.cars.bags.topic_map import load_map
-from coopenv.cars.doctor.checks import listed_checks
 from coopenv.cars.doctor.finding import Treatment
 from coopenv.cars.messages.readings import Twist
 from coopenv.cli.app import main
@@ -135,11 +134,6 @@ def test_trust_is_for_bags() -> None:
     with pytest.raises(CoopenvError, match="trust"):
         coopenv.run("crossing_path", trust=["/imu"])
     assert Selection(trust=("/imu", "clocks")).remark == " (trusted: /imu, clocks)"
-
-
-def test_the_page_lists_the_checks_of_the_code() -> None:
-    page = Path(__file__).resolve().parents[3] / "docs" / "bags.md"
-    assert listed_checks() in page.read_text(encoding="utf-8")
 
 
 def test_only_streams_can_be_trusted(drive: Recording, tmp_path: Path) -> None:
