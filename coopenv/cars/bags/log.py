@@ -483,8 +483,9 @@ def _of_timing(
         yield from of_delays(stamps, received, topic, car)
         if topic in drifts:
             yield from of_drift(drifts[topic], topic, car)
+    left_out = {finding.subject for finding in examined.findings if finding.treatment is Treatment.LEFT_OUT}
     for entry, own in by_topic.items():
-        if entry.role in COMMANDS:
+        if entry.role in COMMANDS or entry.topic in left_out:
             continue
         yield from of_outages(own, entry.topic, end)
         yield from of_repeats(own, entry.topic)

@@ -305,8 +305,10 @@ def explanation(car: CarStreams) -> list[Cause]:
         return [best]
     pairs = []
     for n, (_, one, other) in enumerate(first):
-        if n < TRIED or not (one.free or one.subject == "markers"):
-            pairs += [(one, *second) for second in _ranked(other, causes(other, n < TRIED))[:1]]
+        seconds: Iterable[Cause] = causes(other, n < TRIED) if n < TRIED or not one.free else ()
+        if n >= TRIED and one.subject == "markers":  # frames are searched with all bearings, mountings with most
+            seconds = [_of_frame(other)]
+        pairs += [(one, *second) for second in _ranked(other, seconds)[:1]]
     one, _, two, changed = min(pairs, key=lambda pair: pair[1])
     if sight_of(changed).misfit() < min(REMOVED * REMOVED * given, BAD):
         return [one, two]
