@@ -283,6 +283,8 @@ def _velocity(car: CarStreams, topic: str, what: str, body: Relation) -> Diagnos
 
 FROZEN = 1.0
 """s, least duration of equal values in a row."""
+SLOW = math.radians(1.0)
+"""rad/s of a turn that is no more than a bias: of robots that hold a command, and whose odometry is the command."""
 STUCK = 0.15
 """m by which a position by wheels and one by motion capture may differ over such a time, 0.15 m/s for a second."""
 
@@ -322,7 +324,7 @@ def _frozen_turning(car: CarStreams) -> Iterator[Diagnosis]:
         rate = float(car.tracks["gyro"][first]) + 0.0  # no negative zero
         yaw = np.unwrap(car.tracks["truth_yaw"][inside])
         turned = float(np.ptp(yaw - rate * car.tracks["truth_time"][inside]))
-        if turned > TURNED:
+        if turned > max(TURNED, SLOW * (end - begin)):
             text = f"the turn rate of {car.name} is {rate:.3g} rad/s in a row for {end - begin:.1f} s, in which "
             text += f"motion capture turns it by {math.degrees(turned):.0f} deg"
             about = Finding(car.topic(TURNING), text, turned, None, "", Treatment.REFUSED, car.name)

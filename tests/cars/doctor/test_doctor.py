@@ -15,18 +15,20 @@ import pytest
 
 from coopenv.cars.backend.binding import Binding, bind
 from coopenv.cars.bags.clocks import SampledSignal
-from coopenv.cars.calibration.drives import drive_of_car
-from coopenv.cars.doctor.doctor import examine, examine_constants
-from coopenv.cars.doctor.finding import Treatment, with_error
+from coopenv.cars.calibration.drives import drive_of_car, streams_of_recording
+from coopenv.cars.doctor import doctor
+from coopenv.cars.doctor.doctor import examine, examine_cars, examine_constants
+from coopenv.cars.doctor.finding import Diagnosis, Finding, Treatment, with_error
 from coopenv.cars.doctor.live import StreamMonitor
 from coopenv.cars.doctor.motion import of_frozen_streams, velocity_relations
 from coopenv.cars.doctor.relation import relation
 from coopenv.cars.doctor.sight import thinned
-from coopenv.cars.doctor.streams import Streams
+from coopenv.cars.doctor.streams import CarStreams, Streams
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist
 from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.deployment import Car
 from coopenv.cars.settings.profile import Role
+from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 
 PLACES = np.array([[0.3, 2.6, 0.45], [-1.9, 2.2, 0.08], [2.1, 1.5, 0.25], [2.4, -1.3, 0.5], [-0.8, -2.3, 0.3]])
@@ -350,3 +352,51 @@ def test_a_velocity_that_points_aside_has_no_scale_as_its_key() -> None:
 
     [found] = [f for f in examine(streams_of(change)).findings if "velocity" in f.text]
     assert re.search(r"points 1[12]\.\d*\(\d+\) deg to the left", found.text) and not found.key
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("truth mirrored", "focal length 3 % off"),
+        ("gyro is zero", "wheels in km/h"),
+        ("body of truth turned", "image mirrored"),
+        ("wheels end", "truth in another frame"),
+    ],
+)
+def test_a_fault_that_another_one_hides_is_named(first: str, second: str) -> None:
+    one, two = FAULTS[first], FAULTS[second]
+    text = "\n".join(map(str, found := findings_of(streams_of(lambda value, t: two[0](one[0](value, t), t)))))
+    assert len(found) == 2 and re.search(one[1], text) and re.search(two[1], text), text
+
+
+def test_a_cause_without_which_the_others_explain_all_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first check names a harmless cause as well, which no other check needs."""
+    right = doctor._of_motion
+
+    def eager(car: CarStreams) -> Any:
+        wrong = Finding("/harmless", "nothing is wrong")
+        yield from [Diagnosis(wrong, lambda car: car), *right(car)]
+
+    faulty = streams_of(FAULTS["wheels in km/h"][0]).car("car")
+    monkeypatch.setattr(doctor, "_of_motion", eager)
+    assert "/harmless" in [each.finding.subject for each in doctor.diagnosed(faulty)]
+    monkeypatch.setattr(doctor, "_of_motion", lambda car: [each for each in eager(car) if [*right(car)]])
+    assert [each.finding.subject for each in doctor.diagnosed(faulty)] == ["/car/wheel"]
+
+
+def test_a_velocity_that_is_measured_in_no_message_refuses_the_drive() -> None:
+    def change(value: Any, _: float) -> Any:
+        return Twist(None, value.angular) if isinstance(value, Twist) else value
+
+    [found] = [f for f in findings_of(streams_of(change)) if f.treatment is Treatment.REFUSED]
+    assert "velocity of car is measured in none of" in found.text and found.subject == "/car/wheel"
+
+
+def test_recordings_go_through_the_same_checks() -> None:
+    """Without an environment, as MR.CLAM: bearings in the body frame."""
+    recording = replace(record(load_scenario("svea_overtaking", {"horizon": 10.0}), 1), scenario=None)
+    assert not examine_cars(streams_of_recording(recording)).findings
+    place = recording.truth.position * 1000.0
+    wrong = replace(recording, truth=replace(recording.truth, position=place))
+    found = examine_cars(streams_of_recording(wrong)).findings
+    assert any("it is in mm" in finding.text for finding in found)

@@ -1,0 +1,83 @@
+"""When messages come: what is stated of outages, duplicates, delays, drifts and frames, and what is ordinary."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coopenv.cars.doctor.finding import Treatment
+from coopenv.cars.doctor.timing import of_delays, of_drift, of_duplicates, of_frames, of_outages, of_repeats
+from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist
+from coopenv.cars.messages.stated import Stated
+from coopenv.cars.settings.profile import Role
+
+S = 1_000_000_000
+EVERY = np.arange(0.0, 20.0, 0.02)
+
+
+def samples(times: np.ndarray, role: Role = Role.IMU, stated: Stated | None = None) -> list[Sample]:
+    values = {
+        Role.IMU: lambda t: Twist(None, np.array([0.0, 0.0, np.sin(t)])),
+        Role.TRUTH: lambda t: CarPose(np.array([np.floor(50.0 * t) / 50.0, 0.0, 0.0])),
+        Role.DETECTIONS: lambda t: Detections((1,), np.array([[0.0, 0.0, 1.0]])),
+    }
+    made = values[role]
+    return [Sample("car", role, round(S * t), round(S * t), made(t), stated or Stated()) for t in times]
+
+
+def silent(*gaps: tuple[float, float]) -> np.ndarray:
+    kept = np.ones(len(EVERY), dtype=bool)
+    for begin, end in gaps:
+        kept &= (begin > EVERY) | (end < EVERY)
+    return EVERY[kept]
+
+
+def test_an_outage_is_stated_and_short_ones_are_ordinary() -> None:
+    [found] = of_outages(samples(silent((5.0, 8.0), (12.0, 14.0))), "/imu", 20 * S)
+    assert found.treatment is Treatment.USED and "an outage of 3.0 s after 5.0 s, the longest of 2" in str(found)
+    assert not [*of_outages(samples(silent((5.0, 6.0), (9.0, 9.5))), "/imu", 20 * S)]
+    [ended] = of_outages(samples(EVERY[EVERY < 12.0]), "/imu", 20 * S)
+    assert ended.size == pytest.approx(8.0, abs=0.05)
+
+
+def test_a_camera_that_is_silent_without_a_marker_has_no_outage() -> None:
+    often = silent(*((begin, begin + 2.0) for begin in np.arange(1.0, 19.0, 3.0)))
+    assert not [*of_outages(samples(often, Role.DETECTIONS), "/camera", 20 * S)]
+    assert [*of_outages(samples(silent((5.0, 9.0)), Role.DETECTIONS), "/camera", 20 * S)]
+
+
+def test_messages_that_come_twice_are_left_out_by_their_stamp() -> None:
+    stamps = np.repeat(np.arange(1, 200) * 10_000_000, 2)
+    [found] = of_duplicates(stamps, "/imu", "car")
+    assert found.treatment is Treatment.LEFT_OUT and "199 of 398" in found.text
+    assert not [*of_duplicates(stamps[::2], "/imu", "car")] and not [*of_duplicates(0 * stamps, "/imu", "car")]
+
+
+def test_poses_that_repeat_under_new_stamps_are_duplicates() -> None:
+    assert [*of_repeats(samples(np.arange(0.0, 20.0, 0.01), Role.TRUTH), "/pose")]
+    assert not [*of_repeats(samples(EVERY + 0.001, Role.TRUTH), "/pose")] and not [*of_repeats(samples(EVERY), "/imu")]
+
+
+def test_a_delay_that_changes_is_stated() -> None:
+    stamps = np.arange(1, 1000) * 10_000_000
+    jitter = np.abs(np.random.default_rng(0).normal(0.0, 0.005 * S, len(stamps))).astype(np.int64)
+    assert not [*of_delays(stamps, stamps + S + jitter, "/imu", "car")]
+    emptied = -(-stamps // (S // 2)) * (S // 2)
+    [found] = of_delays(stamps, emptied, "/imu", "car")
+    assert "up to 0.4" in found.text and found.treatment is Treatment.USED
+
+
+def test_no_crystal_drifts_by_two_milliseconds_per_second() -> None:
+    assert not [*of_drift(80e-6, "/imu", "car")]
+    [found] = of_drift(-0.002, "/imu", "car")
+    assert "-2000 us per s" in found.text and found.treatment is Treatment.MENDED
+
+
+@pytest.mark.parametrize(
+    ("child", "in_the_room", "words"),
+    [("car", False, ""), ("car", True, "pose's frame"), ("odom", False, "body's frame"), ("odom", True, "")],
+)
+def test_the_frame_that_a_twist_states_is_tested(child: str, in_the_room: bool, words: str) -> None:
+    about = samples(EVERY, stated=Stated(frame="odom", child_frame=child))
+    found = [str(finding) for finding in of_frames(about, "/odom", {"mocap"}, in_the_room)]
+    assert bool(found) == bool(words) and all(words in line for line in found)
