@@ -115,7 +115,14 @@ def changed(car: CarStreams, diagnoses: Iterable[Diagnosis]) -> CarStreams:
 def _unnamed(car: CarStreams, named: Sequence[Diagnosis]) -> Iterator[list[Diagnosis]]:
     """Yield what each check finds, but for what is named already, in the order in which faults hide each other."""
     known = {_words(each.finding) for each in named}
-    for check in (_of_unmeasured, _of_constant_turning, of_frozen_streams, of_sight, _of_motion):
+    unexplained = any(each.change is None and each.finding.subject == car.topic([Role.TRUTH]) for each in named)
+    checks: list[Callable[[CarStreams], Iterator[Diagnosis]]] = [
+        _of_unmeasured,
+        _of_constant_turning,
+        of_frozen_streams,
+    ]
+    checks += [] if unexplained else [of_sight]
+    for check in (*checks, partial(_of_motion, unexplained=unexplained)):
         if new := [each for each in check(car) if _words(each.finding) not in known]:
             yield new
 
@@ -142,10 +149,9 @@ def _of_constant_turning(car: CarStreams) -> Iterator[Diagnosis]:
         yield Diagnosis(about, (lambda car: car.following_truth("gyro")) if car.truth_signals else None)
 
 
-def _of_motion(car: CarStreams) -> Iterator[Diagnosis]:
-    unexplained = any(each.change is None for each in of_sight(car))
+def _of_motion(car: CarStreams, unexplained: bool) -> Iterator[Diagnosis]:
     use_truth = not (unexplained and turns_contradict(car))
-    if np.ptp(car.tracks["gyro"]) > 0.0 if len(car.tracks["gyro"]) else False:
+    if len(rates := car.tracks["gyro"]) and np.ptp(rates) > 0.0:
         yield from of_turning(car, use_truth)
     yield from of_velocity(car, use_truth)
 

@@ -373,14 +373,18 @@ def test_a_cause_without_which_the_others_explain_all_is_taken_back(monkeypatch:
     """The first check names a harmless cause as well, which no other check needs."""
     right = doctor._of_motion
 
-    def eager(car: CarStreams) -> Any:
+    def eager(car: CarStreams, unexplained: bool) -> Any:
         wrong = Finding("/harmless", "nothing is wrong")
-        yield from [Diagnosis(wrong, lambda car: car), *right(car)]
+        yield from [Diagnosis(wrong, lambda car: car), *right(car, unexplained)]
 
     faulty = streams_of(FAULTS["wheels in km/h"][0]).car("car")
     monkeypatch.setattr(doctor, "_of_motion", eager)
     assert "/harmless" in [each.finding.subject for each in doctor.diagnosed(faulty)]
-    monkeypatch.setattr(doctor, "_of_motion", lambda car: [each for each in eager(car) if [*right(car)]])
+
+    def while_there_is_a_fault(car: CarStreams, unexplained: bool) -> Any:
+        return eager(car, unexplained) if [*right(car, unexplained)] else []
+
+    monkeypatch.setattr(doctor, "_of_motion", while_there_is_a_fault)
     assert [each.finding.subject for each in doctor.diagnosed(faulty)] == ["/car/wheel"]
 
 
@@ -400,3 +404,24 @@ def test_recordings_go_through_the_same_checks() -> None:
     wrong = replace(recording, truth=replace(recording.truth, position=place))
     found = examine_cars(streams_of_recording(wrong)).findings
     assert any("it is in mm" in finding.text for finding in found)
+
+
+@pytest.mark.parametrize(
+    ("change", "words", "treatment"),
+    [
+        (FAULTS["wheels in km/h"][0], "km/h instead of m/s", Treatment.REFUSED),
+        (FAULTS["truth mirrored"][0], "it is mirrored", Treatment.REFUSED),
+        (FAULTS["image mirrored"][0], "its image is mirrored", Treatment.REFUSED),
+        (twist(linear=1.15), r"velocity of car is 1\.1[67]", Treatment.USED),
+        (FAULTS["focal length 3 % off"][0], "focal length: a wrong constant", Treatment.USED),
+    ],
+)
+def test_live_cars_refuse_what_nothing_mends_and_warn_of_what_a_bag_warns_of(
+    change: Change, words: str, treatment: Treatment
+) -> None:
+    streams = streams_of(change)
+    monitor = StreamMonitor(streams.binding, lenses=streams.lenses)
+    for sample in streams.samples:
+        monitor.put(sample)
+    found = [f for f in (*monitor.findings(), *monitor.constants()) if re.search(words, str(f))]
+    assert found and found[0].treatment is treatment
