@@ -26,8 +26,9 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, listed
 from coopenv.cars.backend.binding import Binding, check_calibrated
-from coopenv.cars.bags.clocks import Delay, Leads, checked, jumps, leads_of, moves_of
+from coopenv.cars.bags.clocks import Delay, Leads, checked, jumps
 from coopenv.cars.bags.files import BagFile
+from coopenv.cars.bags.leads import leads_of, moves_of
 from coopenv.cars.bags.topic_map import COMMANDS, TRUTH, UNNEEDED, Chosen, ClockSettings, MapFrame, TopicMap, select
 from coopenv.cars.bags.topics import NS, TopicRow, regularity
 from coopenv.cars.bags.transforms import StaticTree, odd_mountings, unread_truth

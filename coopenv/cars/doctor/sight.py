@@ -301,7 +301,7 @@ def explanation(car: CarStreams) -> list[Cause]:
     """Return the cause, or the two together, that remove the misfit of a thinned car; none: no two do."""
     given, first = sight_of(car).misfit(), _ranked(car, causes(car))
     least, best, changed = first[0]
-    if sight_of(changed).misfit() < min(REMOVED * given, BAD):
+    if sight_of(changed).misfit() < min(REMOVED * given, BAD) or (best.small and least < REMOVED * given):
         return [best]
     pairs = []
     for n, (_, one, other) in enumerate(first):
