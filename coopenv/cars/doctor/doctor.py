@@ -32,6 +32,7 @@ ROUNDS = 6
 """Times that all checks look at a car."""
 Mend = Callable[[Sample], Sample | None]
 """Returns a sample without a fault; None: it is left out."""
+Check = Callable[[CarStreams], Iterator[Diagnosis]]
 
 
 @dataclass
@@ -116,13 +117,9 @@ def _unnamed(car: CarStreams, named: Sequence[Diagnosis]) -> Iterator[list[Diagn
     """Yield what each check finds, but for what is named already, in the order in which faults hide each other."""
     known = {_words(each.finding) for each in named}
     unexplained = any(each.change is None and each.finding.subject == car.topic([Role.TRUTH]) for each in named)
-    checks: list[Callable[[CarStreams], Iterator[Diagnosis]]] = [
-        _of_unmeasured,
-        _of_constant_turning,
-        of_frozen_streams,
-    ]
-    checks += [] if unexplained else [of_sight]
-    for check in (*checks, partial(_of_motion, unexplained=unexplained)):
+    checks: list[Check] = [_of_unmeasured, _of_constant_turning, of_frozen_streams]
+    checks += [*([] if unexplained else [of_sight]), partial(_of_motion, unexplained=unexplained)]
+    for check in checks:
         if new := [each for each in check(car) if _words(each.finding) not in known]:
             yield new
 
