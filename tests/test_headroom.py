@@ -28,7 +28,7 @@ pytestmark = pytest.mark.headroom
 
 WORLDS = {"open_square": 16, "facade": 16, "behind_truck": 16, "urban_crossing": 48, "large_crossing": 6}
 """Number of worlds for intervals that separate the drivers."""
-OF_CONTACT = {"underpass": 16, "warehouse": 16}
+OF_CONTACT = {"underpass": 4, "warehouse": 4}
 """The same, where measurements between vehicles localise those that nothing else does."""
 MOST_TIME = 0.05
 """Share of the travel time that looking may cost."""
