@@ -21,6 +21,7 @@ from coopenv.policies.base import played_back
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.runs.recorder import record
 from tests.helpers.commands import refused
+from tests.helpers.short_benchmark import short_definition
 
 MINE = Path(__file__).parents[2] / "examples" / "own_observer.py"
 
@@ -47,14 +48,14 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_own_observer_has_its_row_beside_the_zoo(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With two of the four seeds, which is another scene."""
+    """In 3 s of two of the four seeds, which is another scene."""
     copyfile(MINE, tmp_path / "mine.py")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(Frozen, "seeds", range(1000, 1002))
-    assert main(["bench", "v1", "mine.py:Ekf,dead_reckoning", "--scenes", "road_slow", "--jobs", "1"]) == 0
+    monkeypatch.setattr(Frozen, "definition", short_definition(2, 3.0))
+    assert main(["bench", "v1", "mine.py:Ekf,dead_reckoning", "--scenes", "lane", "--jobs", "1"]) == 0
     table = capsys.readouterr().out
     result = json.loads((tmp_path / "bench_v1.json").read_text())
-    other = "scene road_slow: its scenario is not the frozen one"
+    other = "scene lane: its scenario is not the frozen one"
     assert result["remarks"] == ["29 scenes were left out", other] and not result["comparable"]
     assert f"Not comparable with the zoo's rows: 29 scenes were left out, {other}" in table
     assert "* Ekf" in table and "\nrobust" in table

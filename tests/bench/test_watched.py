@@ -17,6 +17,7 @@ from coopenv.bench.frozen import Frozen, report
 from coopenv.cli.app import main
 from tests.helpers.commands import refused
 from tests.helpers.processes import DEADLOCK
+from tests.helpers.short_benchmark import short_definition
 
 PLUGINS = '''
 import ctypes, os, subprocess, sys, time
@@ -127,9 +128,7 @@ def test_an_observer_that_takes_too_long_is_not_tried_in_other_scenes(
     (tmp_path / "own.py").write_text(PLUGINS + counted.format("Loops") + counted.format("Raises"))
     monkeypatch.chdir(tmp_path)
     benchmark, names = Frozen("v1"), ["lane", "ring"]
-    benchmark.definition["seeds"] = 2
-    for about in benchmark.definition["scenes"]:
-        about["set"] = {**about.get("set", {}), "horizon": 1.0}
+    monkeypatch.setattr(Frozen, "definition", short_definition(2, 1.0))
     observers = ["own.py:MyLoops", "own.py:MyRaises"]
     result = benchmark.run(observers, names, 1, ProcessLimits(seconds=2.0), lambda share: None)
     rows = {(row["observer"], row["scene"]): row for row in result["rows"]}
@@ -162,8 +161,8 @@ def test_standard_output_is_one_document_and_the_status_that_of_a_failure(
     prints = "print('loaded')\nclass Prints(Fine):\n    def misbehave(self):\n        os.write(1, b'run')\n"
     (tmp_path / "mine.py").write_text(PLUGINS + prints + "        0 / 0\n")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(Frozen, "seeds", range(1000, 1001))
-    assert main(["bench", "v1", "mine.py:Prints", "--scenes", "road_slow", "--jobs", "1", "--json"]) == 2
+    monkeypatch.setattr(Frozen, "definition", short_definition(1, 1.0))
+    assert main(["bench", "v1", "mine.py:Prints", "--scenes", "lane", "--jobs", "1", "--json"]) == 2
     out, err = capfd.readouterr()
     assert json.loads(out)["totals"][0]["failed"] == 1
     assert "loaded" in err and "run" in err and err.endswith("error: failed in every scene: Prints\n")
