@@ -335,7 +335,7 @@ def _frozen_truth(car: CarStreams) -> Iterator[Diagnosis]:
     wheel_time, wheel = car.tracks["wheel_time"], car.tracks["wheel"]
     for begin, end, _ in frozen(car.tracks["truth_time"], car.tracks["truth"] + 1e3 * car.tracks["truth_yaw"]):
         moving = (wheel_time >= begin) & (wheel_time <= end)
-        way = float(np.abs(wheel[moving]).mean() * (end - begin)) if moving.any() else 0.0
+        way = float(np.abs(wheel[moving].mean()) * (end - begin)) if moving.any() else 0.0  # without noise
         if way > 2.0 * STUCK:
             text = f"motion capture repeats one pose of {car.name} for {end - begin:.1f} s, in which "
             text += f"its wheels move it by {way:.2f} m"

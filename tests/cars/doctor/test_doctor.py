@@ -330,6 +330,14 @@ def test_a_velocity_that_sticks_after_a_stand_is_found() -> None:
     assert "in a row for 8.0 s" in found.text and "2.37 m" in found.text
 
 
+def test_a_car_that_stands_beside_noisy_wheels_does_not_repeat_its_pose() -> None:
+    t = np.arange(0.0, 20.0, 0.02)
+    noise = 0.05 * np.random.default_rng(0).normal(size=len(t))
+    tracks = {"truth_time": t, "truth": 0.0 * t + 0j, "truth_yaw": 0.0 * t, "wheel_time": t, "wheel": noise + 0j}
+    car: Any = SimpleNamespace(name="car", tracks=tracks | {"gyro_time": t, "gyro": t}, topic=lambda roles: "/truth")
+    assert not [*of_frozen_streams(car)]
+
+
 def test_a_map_without_standing_landmarks_is_compared_with_nothing() -> None:
     assert thinned(replace(streams_of(None).car("car"), places=np.zeros((0, 3)))) is None
 
