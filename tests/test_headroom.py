@@ -18,10 +18,11 @@ from coopenv.api.engine import Engine
 from coopenv.bench.contest import Contest
 from coopenv.bench.evaluation import evaluated
 from coopenv.evaluation import Difference, Episodes, compare_paired, drive, held_out_seeds, ranking_key, score
-from coopenv.evaluation.metrics import LOST, scored_errors
+from coopenv.evaluation.metrics import scored_errors
 from coopenv.policies import load_agent
 from coopenv.scenario import load_scenario
 from coopenv.scenario.difficulty import Difficulty
+from coopenv.scenario.terms import LOST
 from coopenv.training.settings import Ppo
 from sitegen.environments.sensing import cooperation_settings
 from tests.helpers.env_suite import LARGEST, rest_slow

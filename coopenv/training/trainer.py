@@ -18,10 +18,10 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv, LeanPpo, TanhPolicy, differentiate, outputs
 from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.base.errors import CoopenvError
-from coopenv.evaluation.metrics import SETTLED_FROM
 from coopenv.policies import decide, find_agent, load_agent, restart
 from coopenv.policies.network import CRITIC, RightOfWay, layout_tables, load_weights
 from coopenv.scenario import Scenario
+from coopenv.scenario.terms import SETTLED_FROM
 from coopenv.training.batches import APART, LEAST_VARIANCE, Arrays, MixedWorlds, NormalisedEnv
 from coopenv.training.settings import Clone, TrainingPlan
 

@@ -11,8 +11,9 @@ import coopenv
 from coopenv.base.errors import ActionError, CoopenvError
 from coopenv.policies import load_agent
 from coopenv.policies.choice_rows import ChoiceRows
-from coopenv.policies.choices import KEPT, Choices, OldestSight
+from coopenv.policies.choices import KEPT, Choices
 from coopenv.scenario import load_scenario
+from examples.two_streets.oldest_sight import OldestSight
 
 
 class Recorded(OldestSight):
