@@ -1,6 +1,6 @@
 """A rule over choices: serve the vehicle that has not measured the helper for longest.
 
-Try it: `coopenv evaluate examples/two_streets/two_streets.toml --agents examples/two_streets/oldest_sight.py:OldestSight`.
+Drive it with `coopenv evaluate two_streets.toml --agents oldest_sight.py:OldestSight,look_ahead` in this folder.
 """
 
 import numpy as np
