@@ -13,13 +13,11 @@ from coopenv.scenario.schema import neighbour_sets
 class OldestSight(Choices):
     """A helper serves the vehicle that has not measured it for longest; all other vehicles follow their routes.
 
-    Helpers measure landmarks, and the vehicles that they serve measure helpers instead. A helper stays with a vehicle
-    until that has measured it, and changes only to one whose last sight is older by `patience`.
+    Helpers measure landmarks, and the vehicles that they serve measure helpers instead. Ages grow alike, so a helper
+    stays with a vehicle until that has measured it.
     """
 
     needs = (*Choices.needs, "seen_age")
-    patience = 1.3
-    """Ratio of the ages above which a helper changes to another vehicle."""
 
     def __init__(self, scenario: Scenario) -> None:
         """See `Driver`."""
@@ -37,13 +35,7 @@ class OldestSight(Choices):
 
     def choose(self, observations: np.ndarray, present: np.ndarray) -> np.ndarray:
         """See `Choices.choose`."""
-        rows = np.arange(len(present))
         mask, *_ = self.reported(observations)
-        open_to = mask & self.serves[rows % len(self.serves)]
-        need = np.where(open_to, self.read(observations, "seen_age") + 0.5 / self.kept, -1.0)
-        oldest = np.argmax(need, axis=1)
-        now = np.maximum(present - self.first_served, 0)
-        stays = (present >= self.first_served) & open_to[rows, now]
-        stays &= self.patience * need[rows, now] >= need[rows, oldest]
-        chosen = self.first_served + np.where(stays, now, oldest)
-        return np.where(open_to.any(axis=1), chosen, 0)
+        open_to = mask & self.serves[np.arange(len(mask)) % len(self.serves)]
+        oldest = np.argmax(np.where(open_to, self.read(observations, "seen_age"), -1.0), axis=1)
+        return np.where(open_to.any(axis=1), self.first_served + oldest, 0)
