@@ -114,7 +114,7 @@ def team_episodes(
 
 
 AGREEING = {"take_turns": 0.7, "liar_among_us": 0.7, "broken_camera": 0.6}
-"""Least share of worlds in which cooperation earns more, where the planner has the better score in 80 to 91 % of them."""
+"""Least share of worlds in which cooperation earns more, where the planner has the better score in 80 to 91 %."""
 RANKS = {"broken_camera": 0.8}
 """Least rank correlation of return and score, where `peek` and `look_ahead` change places in a few worlds."""
 RANKED = ("constant_speed", "route_follower", "stop_when_lost", "keep_contact", "peek", "general")
