@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -47,10 +48,17 @@ def name_of(path: Path) -> str:
 MODULES = {name_of(path): path for path in sorted(PACKAGE.rglob("*.py"))}
 
 
+@cache
+def nodes_of(path: Path) -> list[ast.Import | ast.ImportFrom | ast.ClassDef]:
+    """Return the imports and classes of a file."""
+    kinds = (ast.Import, ast.ImportFrom, ast.ClassDef)
+    return [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, kinds)]
+
+
 def imports_of(path: Path) -> set[str]:
     """Return every module of the package that a file imports, inside functions and for typing too."""
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -101,8 +109,8 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 
 def test_a_class_name_means_one_class() -> None:
-    trees = [ast.walk(ast.parse(path.read_text(encoding="utf-8"))) for path in MODULES.values()]
-    names = [node.name for tree in trees for node in tree if isinstance(node, ast.ClassDef) and node.name[0] != "_"]
+    classes = [node for path in MODULES.values() for node in nodes_of(path) if isinstance(node, ast.ClassDef)]
+    names = [node.name for node in classes if node.name[0] != "_"]
     assert not sorted({name for name in names if names.count(name) > 1})
 
 

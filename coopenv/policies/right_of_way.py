@@ -37,11 +37,18 @@ def right_of_way(scenario: Scenario) -> np.ndarray:
     return np.asarray(first[~np.eye(len(driven), dtype=bool)].reshape(len(driven), -1))
 
 
-def on_circle(velocity: np.ndarray, curvature: np.ndarray, time: float) -> np.ndarray:
-    """Return the displacements (rows, M, 2), m, of vehicles in a time, s, by velocities, m/s, and curvatures, 1/m."""
-    half = curvature * np.linalg.norm(velocity, axis=-1) * (time / 2.0)  # rad, between the velocity and the chord
-    x, y, c, s = velocity[..., 0], velocity[..., 1], np.cos(half), np.sin(half)
-    return np.asarray((time * np.sinc(half / np.pi))[..., None] * np.stack([c * x - s * y, s * x + c * y], axis=-1))
+def on_circle(velocity: np.ndarray, curvature: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Return the displacements (rows, M, P, 2), m, of vehicles in times (P,), s, on circles.
+
+    Velocities (rows, M, 2) are in m/s, curvatures (rows, M) in 1/m.
+    """
+    half = (curvature * np.linalg.norm(velocity, axis=-1))[..., None] * (times / 2.0)  # rad, from velocity to chord
+    (x, y), c, s = np.moveaxis(velocity[..., None, :], -1, 0), np.cos(half), np.sin(half)
+    return np.asarray((times * np.sinc(half / np.pi))[..., None] * np.stack([c * x - s * y, s * x + c * y], axis=-1))
+
+
+MOST_ROWS = 256
+"""Rows at once: arrays of more do not fit into the processor's cache."""
 
 
 def nearest(
@@ -64,20 +71,26 @@ def nearest(
         until: s.
         curvature: (rows, M), 1/m, of the circles that others drive along, of which chords are taken; None: straight on.
     """
-    found = np.full(len(path), np.inf)
-    for k in range(len(times) - 1):
-        begin, end = times[k], times[k + 1] if k < len(times) - 2 else max(until, times[k + 1])
-        own = (path[:, k + 1] - path[:, k]) / (times[k + 1] - times[k])
-        driven, speed = velocity * begin, velocity
-        if curvature is not None:
-            driven, later = (on_circle(velocity, curvature, time) for time in (begin, end))
-            speed = (later - driven) / (end - begin)
-        apart = place + driven - path[:, k][:, None]
-        away = speed - own[:, None]
-        square = np.maximum((away**2).sum(axis=-1), 1e-9)
-        time = np.clip(-(apart * away).sum(axis=-1) / square, 0.0, min(end, until) - begin)
-        distance = np.linalg.norm(apart + time[..., None] * away, axis=-1)
-        found = np.minimum(found, np.min(distance, axis=1, where=mask, initial=np.inf))
-        if end >= until:
-            break
-    return found
+    if len(path) > MOST_ROWS:
+        parts = []
+        for first in range(0, len(path), MOST_ROWS):
+            part = slice(first, first + MOST_ROWS)
+            bends = None if curvature is None else curvature[part]
+            parts.append(nearest(path[part], times, place[part], velocity[part], mask[part], until, bends))
+        return np.concatenate(parts)
+    count = int(np.searchsorted(times[1:-1], until)) + 1  # of the lines that begin before
+    own = np.diff(path[:, : count + 1], axis=1) / np.diff(times[: count + 1])[:, None]
+    if count == len(times) - 1:
+        times = np.append(times[:-1], max(until, times[-1]))
+    times, lasts = times[: count + 1], np.diff(times[: count + 1])
+    speed = velocity[:, :, None]
+    driven = speed * times[:, None]
+    if curvature is not None:
+        driven = on_circle(velocity, curvature, times)
+        speed = np.diff(driven, axis=2) / lasts[:, None]
+    apart = place[:, :, None] + driven[:, :, :-1] - path[:, None, :count]
+    away = speed - own[:, None]
+    square = np.maximum((away**2).sum(axis=-1), 1e-9)
+    time = np.clip(-(apart * away).sum(axis=-1) / square, 0.0, np.minimum(times[1:], until) - times[:-1])
+    distance = np.linalg.norm(apart + time[..., None] * away, axis=-1).min(axis=-1)
+    return np.asarray(np.min(distance, axis=1, where=mask, initial=np.inf))

@@ -17,6 +17,7 @@ from coopenv.bench.frozen import Frozen, report
 from coopenv.cli.app import main
 from tests.helpers.commands import refused
 from tests.helpers.processes import DEADLOCK
+from tests.helpers.short_benchmark import short_definition
 
 PLUGINS = '''
 import ctypes, os, subprocess, sys, time
@@ -121,17 +122,18 @@ def test_what_misbehaves_is_ended_with_one_line(tmp_path: Path, monkeypatch: pyt
 def test_an_observer_that_takes_too_long_is_not_tried_in_other_scenes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One that raises is tried in all of them. That the rows of others stay is tested above."""
+    """One that raises is tried in all of them. That the rows of others stay is tested above. Scenes are short here."""
     counted = "class My{0}({0}):\n    def reset(self, *start):\n        print('{0}', file=open('log', 'a'))\n"
     counted += "        super().reset(*start)\n"
     (tmp_path / "own.py").write_text(PLUGINS + counted.format("Loops") + counted.format("Raises"))
     monkeypatch.chdir(tmp_path)
     benchmark, names = Frozen("v1"), ["lane", "ring"]
+    monkeypatch.setattr(Frozen, "definition", short_definition(2, 1.0))
     observers = ["own.py:MyLoops", "own.py:MyRaises"]
     result = benchmark.run(observers, names, 1, ProcessLimits(seconds=2.0), lambda share: None)
     rows = {(row["observer"], row["scene"]): row for row in result["rows"]}
     log = (tmp_path / "log").read_text().split()
-    for name, started, seeds in (("Loops", ["lane"], 1), ("Raises", names, 4)):
+    for name, started, seeds in (("Loops", ["lane"], 1), ("Raises", names, 2)):
         assert all(rows[f"My{name}", scene]["failure"] for scene in names)
         vehicles = sum(len(scene.source.scenario.vehicles) for scene in benchmark.scenes(started))
         assert log.count(name) == seeds * vehicles
@@ -159,6 +161,7 @@ def test_standard_output_is_one_document_and_the_status_that_of_a_failure(
     prints = "print('loaded')\nclass Prints(Fine):\n    def misbehave(self):\n        os.write(1, b'run')\n"
     (tmp_path / "mine.py").write_text(PLUGINS + prints + "        0 / 0\n")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Frozen, "definition", short_definition(1, 1.0))
     assert main(["bench", "v1", "mine.py:Prints", "--scenes", "lane", "--jobs", "1", "--json"]) == 2
     out, err = capfd.readouterr()
     assert json.loads(out)["totals"][0]["failed"] == 1

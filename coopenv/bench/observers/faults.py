@@ -14,33 +14,8 @@ from typing import TYPE_CHECKING, Any
 from coopenv.base.errors import CoopenvError, listed, shown, suggest
 from coopenv.base.fault_text import Bounds, Fault, FaultError, FaultKind, parse_fault
 from coopenv.base.sections import LARGEST
-from coopenv.bench.observers.changes import (
-    FAULT_MODELS,
-    NO_FOLLOWERS,
-    leaders_of,
-    usual_sender,
-    with_camera_error,
-    with_correlated_bearings,
-    with_delay,
-    with_focal_error,
-    with_gyro_error,
-    with_jammer,
-    with_landmark_error,
-    with_late_frames,
-    with_lie,
-    with_loss,
-    with_map_error,
-    with_map_exchange,
-    with_map_noise,
-    with_prior_error,
-    with_random_bearings,
-    with_reflections,
-    with_scale_drift,
-    with_scale_error,
-    with_sensors,
-    with_wrong_association,
-    without_landmarks,
-)
+from coopenv.bench.observers import changes
+from coopenv.bench.observers.changes import FAULT_MODELS, NO_FOLLOWERS, leaders_of, usual_sender
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.bodies import MOST_LANDMARKS
 from coopenv.scenario.sensing import LONGEST_REPLAY
@@ -103,17 +78,21 @@ def _of_model(value: str, meaning: str, unit: str, default: float, change: Chang
 
 
 FAULTS: dict[str, RecordFault | WorldFault] = {
-    "v2x_loss": RecordFault("SHARE", "of the messages that is lost", 0.3, high=1.0, change=with_loss),
-    "v2x_delay": RecordFault("SECONDS", "by which messages arrive later", 0.2, change=with_delay),
+    "v2x_loss": RecordFault("SHARE", "of the messages that is lost", 0.3, high=1.0, change=changes.with_loss),
+    "v2x_delay": RecordFault("SECONDS", "by which messages arrive later", 0.2, change=changes.with_delay),
     "wrong_association": RecordFault(
         "SHARE",
         "of the bearings that is swapped with another one of its frame, some of them twice",
         0.05,
         high=1.0,
-        change=with_wrong_association,
+        change=changes.with_wrong_association,
     ),
     "random_bearings": RecordFault(
-        "SHARE", "of the bearings that points in a uniform direction", 0.1, high=1.0, change=with_random_bearings
+        "SHARE",
+        "of the bearings that points in a uniform direction",
+        0.1,
+        high=1.0,
+        change=changes.with_random_bearings,
     ),
     "reflections": RecordFault(
         "SHARE",
@@ -122,14 +101,14 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         high=1.0,
         options={"burst": (1e-3, LARGEST)},
         vehicles=True,
-        change=with_reflections,
+        change=changes.with_reflections,
     ),
     "late_frames": RecordFault(
         "SECONDS",
         "by which camera frames are older than stated; undeclared",
         0.03,
         vehicles=True,
-        change=with_late_frames,
+        change=changes.with_late_frames,
     ),
     "correlated_bearings": RecordFault(
         "STD",
@@ -137,27 +116,35 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         0.003,
         options={"time": SIZE},
         vehicles=True,
-        change=with_correlated_bearings,
+        change=changes.with_correlated_bearings,
     ),
-    "gyro_step": _undeclared("RATE", "by which gyros are biased about the vertical", "rad/s", 0.02, with_gyro_error),
-    "gyro": _of_model("RATE", "gyros have a bias about the vertical", "rad/s", 0.02, with_gyro_error),
+    "gyro_step": _undeclared(
+        "RATE", "by which gyros are biased about the vertical", "rad/s", 0.02, changes.with_gyro_error
+    ),
+    "gyro": _of_model("RATE", "gyros have a bias about the vertical", "rad/s", 0.02, changes.with_gyro_error),
     "camera_step": _undeclared(
-        "ANGLE", "by which cameras are turned to the left on their mountings", "rad", 0.05, with_camera_error
+        "ANGLE", "by which cameras are turned to the left on their mountings", "rad", 0.05, changes.with_camera_error
     ),
-    "camera": _of_model("ANGLE", "cameras are turned to the left on their mountings", "rad", 0.05, with_camera_error),
-    "focal_step": _undeclared("SHARE", "by which focal lengths are too large", "relative", 0.05, with_focal_error),
-    "focal": _of_model("SHARE", "focal lengths are too large", "relative", 0.05, with_focal_error),
+    "camera": _of_model(
+        "ANGLE", "cameras are turned to the left on their mountings", "rad", 0.05, changes.with_camera_error
+    ),
+    "focal_step": _undeclared(
+        "SHARE", "by which focal lengths are too large", "relative", 0.05, changes.with_focal_error
+    ),
+    "focal": _of_model("SHARE", "focal lengths are too large", "relative", 0.05, changes.with_focal_error),
     "scale_drift": _undeclared(
-        "SHARE", "to which the scale error of odometries grows up to the end", "relative", 0.1, with_scale_drift
+        "SHARE", "to which the scale error of odometries grows up to the end", "relative", 0.1, changes.with_scale_drift
     ),
-    "scale": _of_model("SHARE", "odometries read too much", "relative", 0.005, with_scale_error),
+    "scale": _of_model("SHARE", "odometries read too much", "relative", 0.005, changes.with_scale_error),
     "landmark": replace(
-        _of_model("METRES", "a landmark, drawn or by its number, is off on all maps", "m", 1.0, with_landmark_error),
+        _of_model(
+            "METRES", "a landmark, drawn or by its number, is off on all maps", "m", 1.0, changes.with_landmark_error
+        ),
         options={"landmark": range(1, MOST_LANDMARKS + 1), "angle": ANY, **OF_BURSTS},
         vehicles=False,
     ),
     "landmarks_lost": RecordFault(
-        "", "no landmark is visible", 0.0, start=True, duration=True, change=without_landmarks
+        "", "no landmark is visible", 0.0, start=True, duration=True, change=changes.without_landmarks
     ),
     "map_error": RecordFault(
         "[LANDMARK:]METRES",
@@ -167,19 +154,19 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         start=True,
         options={"angle": ANY, "spread": SIZE},
         vehicles=True,
-        change=with_map_error,
+        change=changes.with_map_error,
     ),
     "map_noise": RecordFault(
-        "STD", "of the error of all landmarks on all maps, per axis, m; undeclared", 0.05, change=with_map_noise
+        "STD", "of the error of all landmarks on all maps, per axis, m; undeclared", 0.05, change=changes.with_map_noise
     ),
-    "map_exchange": RecordFault("", "two landmarks are exchanged on all maps", 0.0, change=with_map_exchange),
+    "map_exchange": RecordFault("", "two landmarks are exchanged on all maps", 0.0, change=changes.with_map_exchange),
     "prior_error": RecordFault(
         "METRES",
         "by which initial estimates are off on the map; undeclared",
         3.0,
         options={"angle": ANY},
         vehicles=True,
-        change=with_prior_error,
+        change=changes.with_prior_error,
     ),
     "jammer": RecordFault(
         "METRES",
@@ -189,7 +176,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         duration=True,
         options={"x": ANY, "y": ANY, "z": ANY, "period": (1e-3, LARGEST), "duty": (0.0, 1.0)},
         vehicles=True,
-        change=with_jammer,
+        change=changes.with_jammer,
     ),
     "lie": RecordFault(
         "KIND[:AMOUNT]",
@@ -199,7 +186,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         options={"std": SIZE, "turn": ANY, "angle": ANY, "honest_odometry": range(2)},
         unused={"replay": ("turn", "angle")},
         vehicles=True,
-        change=with_lie,
+        change=changes.with_lie,
     ),
     "odometry_scale": WorldFault("STD", "of the odometry's scale error", key="noise.odometry_scale"),
     "gyro_bias": WorldFault("STD", "of the gyro's bias per axis, rad/s", key="noise.gyro_bias"),
@@ -264,7 +251,7 @@ class FaultVariant:
     def applied(self, recording: Recording, seed: int) -> Recording:
         """Return the changed record; `recording` is of the variant's scenario."""
         if self.sensors is not None:
-            recording = with_sensors(recording, self.sensors)
+            recording = changes.with_sensors(recording, self.sensors)
         for fault in self.faults:
             kind, end = FAULTS[fault.name], float(recording.t[-1])
             if fault.start_in(end) > end:

@@ -332,7 +332,7 @@ def summary(board: Leaderboard, variant: str) -> Table:
     return _add_observers(table, board, variant, cells, board.windows)
 
 
-def _spread(rows: Sequence[WindowRow], column: str, digits: int) -> list[str]:
+def _spread(rows: Sequence[Row] | Sequence[WindowRow], column: str, digits: int) -> list[str]:
     """Return the median vehicle's figure, the worst one's, and which vehicle that is."""
     found = spread(rows, column)
     return [number(found.median, digits), compact(found.worst, found.error), _short(found.vehicle)]
@@ -363,17 +363,11 @@ def sensor_table(board: Leaderboard) -> Table:
         for name in board.ranked:
             rows = board.rows_in(variant, name)
             mean = in_parentheses(*board.totals[variant, name].rmse)
-            found = [*_cells(rows, "position_rmse_m", few), mean, _spread_of(rows, "anees")]
+            found = [*_cells(rows, "position_rmse_m", few), mean, _spread(rows, "anees", 2)[1]]
             failed = any(row.failure for row in rows)
             table.add(shown, name, *([FAILED] * len(found) if failed else found))
             shown = ""
     return table
-
-
-def _spread_of(rows: Sequence[Row], column: str) -> str:
-    """Return the figure of the worst vehicle with its standard error."""
-    found = spread(rows, column)
-    return compact(found.worst, found.error)
 
 
 def failures(rows: Sequence[Row]) -> list[str]:
