@@ -26,12 +26,12 @@ from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers.rows import standard_error
 from coopenv.estimation import Outcome
 from coopenv.evaluation import Episodes, drive, held_out_seeds
-from coopenv.evaluation.metrics import SETTLED_FROM
 from coopenv.policies import Policy, load_agent
 from coopenv.policies.base import decide, restart
 from coopenv.report.table import Table
 from coopenv.runs.console import Progress
 from coopenv.scenario import Scenario
+from coopenv.scenario.terms import SETTLED_FROM
 from coopenv.sources.sources import open_simulation
 
 SEARCH = "search"

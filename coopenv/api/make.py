@@ -152,7 +152,7 @@ def make_rows(
     acting: bool = False,
     **options: Any,
 ) -> VectorEnv[Any, Any, Any]:
-    """Entry point of `gymnasium.make_vec("coopenv/...", num_envs=rows)`; `acting`: rows are those of `ActingRows`.
+    """Entry point of `gymnasium.make_vec("coopenv/...Rows-v0", num_envs=rows)`; `acting`: rows of `ActingRows`.
 
     Raises:
         CoopenvError: `num_envs` is not a multiple of the vehicles.

@@ -1,6 +1,8 @@
 """Register every shipped environment with Gymnasium and PettingZoo as `coopenv/<CamelCase>-v0` and `coopenv/<name>`.
 
-`coopenv/Scenario-v0` takes any scenario, such as `name_or_path="ring:5"`. Entry points are strings, and what they need
+With Gymnasium such an id is one vehicle, and a vector of it has independent worlds. `coopenv/<CamelCase>Rows-v0` is the
+batch whose rows are all vehicles of its worlds (`gymnasium.make_vec` alone). `coopenv/Scenario-v0` takes any scenario,
+such as `name_or_path="ring:5"`. Entry points are strings, and what they need
 is imported when an environment is made: `import coopenv` costs little.
 """
 
@@ -60,12 +62,15 @@ def registered_spec(environment: str, overrides: Mapping[str, Any] | None = None
 def register_all() -> None:
     """Register what is not registered yet."""
     given = {identity: {"name_or_path": n} for n in list_envs() for identity in (environment_id(n), f"coopenv/{n}")}
+    for name in (*list_envs(), "scenario"):
+        if (identity := environment_id(f"{name}_rows")) not in gymnasium.registry:
+            kwargs = {} if name == "scenario" else {"name_or_path": name}
+            gymnasium.register(identity, vector_entry_point="coopenv.api.make:make_rows", kwargs=kwargs)
     for identity, kwargs in {**given, environment_id("scenario"): {}}.items():
         if identity not in gymnasium.registry:
             gymnasium.register(
                 identity,
                 entry_point="coopenv.api.single_vehicle:SingleVehicleEnv",
-                vector_entry_point="coopenv.api.make:make_rows",
                 kwargs=kwargs,
             )
         for kind, registry in (("parallel", parallel_registry), ("aec", aec_registry)):

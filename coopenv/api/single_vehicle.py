@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +9,7 @@ import gymnasium
 import numpy as np
 
 from coopenv.api.make import parallel_env
-from coopenv.api.parallel_env import RENDER_MODES, CooperativeLocalisationEnv
+from coopenv.api.parallel_env import RENDER_MODES, AgentInfo, CooperativeLocalisationEnv
 from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.base.installation import load_reference
 from coopenv.policies.base import Policy, decide, restart
@@ -33,6 +32,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         *,
         vehicle: str | None = None,
         others: str | Policy | None = None,
+        details: bool = False,
         **options: Any,
     ) -> None:
         """Build the environment.
@@ -42,12 +42,15 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
             vehicle: the one that the action drives (None: the last driven one, which receives from most others).
             others: drives the other vehicles: what `find_agent` takes (None: `route_follower`, or where it cannot
                 drive, straight on).
+            details: let infos of Gymnasium's vectors hold estimate, truth and reward terms as well; infos of a single
+                environment have them under their names anyway.
             **options: the other arguments of `coopenv.parallel_env`.
 
         Raises:
             CoopenvError: no such vehicle, or no such agent.
         """
         self._spec: EnvSpec | None = None
+        self._info_kind = dict if details else AgentInfo
         self.world: CooperativeLocalisationEnv = parallel_env(name_or_path, **options)
         names, scenario = self.world.possible_agents, self.world.scenario
         self.vehicle = names[-1] if vehicle is None else vehicle
@@ -67,8 +70,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
         if spec is not None and spec.max_episode_steps is None:
-            decisions = math.ceil(self.scenario.horizon_ticks / self.scenario.ticks_per_decision)
-            spec = replace(spec, max_episode_steps=decisions)
+            spec = replace(spec, max_episode_steps=self.scenario.decisions)
         self._spec = spec
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -82,7 +84,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         else:
             raise CoopenvError(f"{self.vehicle} was absent in {MOST_EPISODES} episodes running")
         restart(self._others, np.ones(len(self.scenario.vehicles), dtype=bool))
-        return observations[self.vehicle], dict(infos[self.vehicle])
+        return observations[self.vehicle], self._info_kind(infos[self.vehicle])
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Drive the vehicle for one decision period.
@@ -99,7 +101,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         v = self.vehicle
         if v not in rewards:
             raise CoopenvError(f"step() called although {v} has ended; call reset()")
-        return observations[v], rewards[v], terminated[v], truncated[v], dict(infos[v])
+        return observations[v], rewards[v], terminated[v], truncated[v], self._info_kind(infos[v])
 
     def render(self) -> Any:
         """Draw the top view."""

@@ -14,11 +14,12 @@ from coopenv.base.format import NONE
 from coopenv.base.installation import load_reference
 from coopenv.bench.contest import BASELINE, Contest
 from coopenv.evaluation import METRICS, Difference, Episodes, Result, compare_paired, score
-from coopenv.evaluation.metrics import LOSSES, LOST, ranking_key
+from coopenv.evaluation.metrics import LOSSES, ranking_key
 from coopenv.report.notebook import WIDTH, one_line, picture_html, terminal_html
 from coopenv.report.table import Table
 from coopenv.report.tabular import Tabular
 from coopenv.report.terminal import text_of
+from coopenv.scenario.terms import LOST
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -242,7 +242,7 @@ def drive(
         outcome=view("ended")[:, chosen].copy(),
         sees=np.stack(sees[1:]),
         goal=(count > 0) & scenario.termination.arrival,
-        horizon=-(-ticks // scenario.ticks_per_decision),
+        horizon=scenario.decisions,
     )
 
 

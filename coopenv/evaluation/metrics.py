@@ -14,6 +14,7 @@ import numpy as np
 from coopenv.estimation import Outcome
 from coopenv.estimation.metrics import LEVEL, Interval, wilson_interval
 from coopenv.evaluation.episodes import Episodes
+from coopenv.scenario.terms import LOST, SETTLED_FROM
 
 RESAMPLES = 2000
 _BINS = 2000
@@ -102,10 +103,6 @@ def interval(values: np.ndarray) -> Interval:
 
 
 COLLIDED = Outcome.COLLIDED
-SETTLED_FROM = 3.0
-"""Time (s) from which errors count: before it they are the initial estimate's."""
-LOST = 1.0
-"""Position error (m) that counts for a lost vehicle, and for every larger error."""
 LOSSES = 0.02
 """Step of the share of lost vehicles by which drivers are ranked before their errors."""
 SCORE = 2

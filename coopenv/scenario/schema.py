@@ -275,6 +275,11 @@ class Scenario(Section, metaclass=_Loaded):
         """Camera ticks of an episode."""
         return max(1, round(self.horizon * self.rates.camera))
 
+    @property
+    def decisions(self) -> int:
+        """Decisions of an episode that nothing ends sooner."""
+        return -(-self.horizon_ticks // self.ticks_per_decision)
+
     @field_validator("landmarks")
     @classmethod
     def _names_are_free(cls, landmarks: tuple[Landmark, ...]) -> tuple[Landmark, ...]:

@@ -18,6 +18,9 @@ from coopenv.base.sections import Number, Positive, Section, Text
 LOG_SCALE = 10.0
 """Decades (or nepers of log det P / 6) that fill the range of a logarithmic entry."""
 
+ROLES = 16
+"""Vehicles with a role of their own, the first ones of a fleet."""
+
 COLUMNS = ("per", "size", "unit", "scale", "low", "meaning", "planar", "center")
 """Columns of a field; the last two only if unusual: entries for a vehicle on a plane, and the value read as 0."""
 XY = (0, 1)
@@ -124,6 +127,22 @@ FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
         ("last_action", "vehicle", 3, "1", 1, -1, "action of the last decision, its first three entries at most"),
         ("time_left", "vehicle", 1, "horizon", 0.5, -1, "share of the horizon that is left", None, 0.5),
     ],
+    "stated": [
+        ("message_std", "neighbour", 1, "log10 m", 1.5, -1,
+         "log10 of the standard deviation of the neighbour's position that its last report states; 1: none at hand",
+         None, -1.25),
+    ],
+    "found": [
+        ("bearing_found", "target", 1, "bool", 1, 0, "1: its bearing was measured in this episode"),
+        ("sighting_found", "neighbour", 1, "bool", 1, 0, "1: the neighbour was measured in this episode"),
+        ("seen_found", "neighbour", 1, "bool", 1, 0,
+         "1: by its last message, the neighbour has measured this vehicle in this episode"),
+        ("map_found", "landmark", 1, "bool", 1, 0, "1: its bearing was measured in this episode"),
+    ],
+    "role": [
+        ("role", "vehicle", ROLES, "bool", 1, 0,
+         "1 at the vehicle's number in the fleet, 0 elsewhere: a shared policy can distinguish vehicles"),
+    ],
     "pan": [
         ("camera_pan", "vehicle", 1, "rad", "pan", -1, "angle by which the camera is turned, positive to the left"),
     ],
@@ -137,6 +156,10 @@ SETTINGS: dict[str, tuple[str, ...]] = {  # what entries mean also depends on th
 }
 SETTINGS_OF_ACTIONS = ("rates.decision", "dynamics.max_speed")
 
+SETTLED_FROM = 3.0
+"""Time (s) from which errors count in the score: before it they are the initial estimate's."""
+LOST = 1.0
+"""Position error (m) that counts in the score for a lost vehicle, and for every larger error."""
 REWARDS: list[tuple[str, str, bool, str]] = [  # name, unit, privileged, meaning
     ("progress", "m", True,
      "Decrease of the true distance to the goal: along the drawn route, or else in a straight line"),
@@ -150,6 +173,9 @@ REWARDS: list[tuple[str, str, bool, str]] = [  # name, unit, privileged, meaning
      "56 bytes; a broadcast counts once, with `action.radio` every receiver"),
     ("position_error", "m", True, "Minus the position error"),
     ("orientation_error", "rad", True, "Minus the orientation error"),
+    ("scored_error", "m s", True,
+     "Minus the errors of the score, times the time: the position error from 3 s on, at most 1 m, and 1 m for the rest "
+     "of the way of a vehicle that collides or does not arrive"),
     ("position_uncertainty", "m^2", False,
      "Per metre gained: minus the part of sqrt(trace P_pos) above the threshold, at most the cap"),
     ("position_error_per_metre", "m^2", True,

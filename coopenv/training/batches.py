@@ -89,7 +89,8 @@ class NormalisedEnv(VecEnvWrapper):
             observation_space=spaces.Box(-ppo.observation_clip, ppo.observation_clip, shape=shape, dtype=np.float32),
         )
         self.statistics = RunningMeanStd(shape=shape or ())
-        self._clip, self._scale, self._gamma = ppo.observation_clip, ppo.reward_scale, ppo.gamma
+        self._clip, self._scale = ppo.observation_clip, ppo.reward_scale
+        self._gamma = ppo.discount(venv.scenario)
         self.spread = RunningMeanStd(shape=())
         """Running mean and variance of discounted returns, in the units of the scenario."""
         self.returns = np.zeros(venv.num_envs)

@@ -113,7 +113,7 @@ class SetTrainer:
         self, scenario: Scenario, worlds: int, driver: SetDriver, apart: int, report: Callable[[str], None]
     ) -> tuple[np.ndarray, ...]:
         """Return inputs, and the planner's steering, (rows,) in rad, in worlds of a scenario."""
-        seed, gamma = self.plan.seed + apart, self.plan.settings.ppo.gamma
+        seed, gamma = self.plan.seed + apart, self.plan.settings.ppo.discount(scenario)
         seen, actions, _, vehicle = watch(scenario, worlds, self.clone, gamma, seed, self.threads, report)
         steering = driver.layout.action[1].high * actions[:, 1]
         return *driver.inputs(seen, vehicle), steering.astype(np.float32)

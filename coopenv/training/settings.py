@@ -55,8 +55,8 @@ class Ppo(Section):
     """Passes over each rollout."""
     learning_rate: Positive = 1e-3
     """Initial learning rate of Adam; falls linearly to zero."""
-    gamma: Share = 0.99
-    """Discount per decision."""
+    gamma: Share | None = None
+    """Discount per decision; without: 1 - 1 / the decisions of an episode, so that its end counts from the start."""
     gae_lambda: Probability = 0.95
     """Lambda of the generalised advantage estimate (Schulman et al. 2016)."""
     clip: Positive = 0.2
@@ -82,6 +82,10 @@ class Ppo(Section):
         if self.vehicles * self.decisions < 2:
             raise ValueError("decisions: one decision of one vehicle is no rollout, advantages need two at least")
         return self
+
+    def discount(self, scenario: Scenario) -> float:
+        """Return the discount per decision in a scenario."""
+        return self.gamma or 1.0 - 1.0 / max(2, scenario.decisions)
 
 
 class Clone(Section):

@@ -18,10 +18,10 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv, LeanPpo, TanhPolicy, differentiate, outputs
 from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.base.errors import CoopenvError
-from coopenv.evaluation.metrics import SETTLED_FROM
 from coopenv.policies import decide, find_agent, load_agent, restart
 from coopenv.policies.network import CRITIC, RightOfWay, layout_tables, load_weights
 from coopenv.scenario import Scenario
+from coopenv.scenario.terms import SETTLED_FROM
 from coopenv.training.batches import APART, LEAST_VARIANCE, Arrays, MixedWorlds, NormalisedEnv
 from coopenv.training.settings import Clone, TrainingPlan
 
@@ -215,6 +215,8 @@ class Trainer:
         self.env = NormalisedEnv(self.batch, ppo, rule)
         self._rollout = ppo.decisions * self.env.num_envs
         self._share, self.seconds, self.cpu_seconds = 0.0, 0.0, 0.0
+        self.gamma = ppo.discount(scenario)
+        """Discount per decision."""
         widths = list(ppo.hidden)
         self.model = self.algorithm(
             self.policy,
@@ -223,7 +225,7 @@ class Trainer:
             n_steps=ppo.decisions,
             batch_size=max(2, self._rollout // ppo.minibatches),
             n_epochs=ppo.epochs,
-            gamma=ppo.gamma,
+            gamma=self.gamma,
             gae_lambda=ppo.gae_lambda,
             clip_range=ppo.clip,
             ent_coef=ppo.entropy,
@@ -267,13 +269,13 @@ class Trainer:
         Its observations are also the first in the statistics for normalisation. Noise is added to its actions, so that
         its corrections of deviations are recorded (Laskey et al. 2017).
         """
-        policy, ppo, seed = self.model.policy, self.plan.settings.ppo, self.plan.seed
+        policy, seed = self.model.policy, self.plan.seed
         all_worlds, threads = sum(count for _, count in self._scenarios), self.batch.engine.world.threads
         watched = []
         for place, (each, count) in enumerate(self._scenarios):
             worlds, start = max(1, clone.episodes * count // all_worlds), seed + APART * place
             rule = RightOfWay(each) if self.rule else None
-            watched.append(watch(each, worlds, clone, ppo.gamma, start, threads, report, rule))
+            watched.append(watch(each, worlds, clone, self.gamma, start, threads, report, rule))
         raw, actions, returns, _ = (np.concatenate(column) for column in zip(*watched, strict=True))
         if critic_only:
             self.env.statistics.count = len(raw)

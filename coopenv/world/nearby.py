@@ -237,6 +237,7 @@ def clear_box(state: Any, world: int, vehicle: int, box: int):
     state.inbox_pose_only[world, vehicle, box] = 0
     state.inbox_position[world, vehicle, box] = o
     state.inbox_rotation[world, vehicle, box] = identity3(o)
+    state.inbox_std[world, vehicle, box] = o[0]
 
 
 @device_function

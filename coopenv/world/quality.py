@@ -84,6 +84,13 @@ def position_variance(P: Any, p_hat: Any):
 
 
 @device_function
+def state_deviation(state: Any, world: int, vehicle: int, slot: int):
+    """Add the standard deviation of the position to a vehicle's broadcast estimate."""
+    variance = position_variance(state.covariance[world, vehicle], state.estimate_position[world, vehicle])
+    state.outbox_std[world, vehicle, slot] = wp.sqrt(variance)
+
+
+@device_function
 def usable(model: Any, state: Any, world: int, vehicle: int, entry: int, target: int, tick: int) -> bool:
     """Return whether the observer can use an entry's agent now: seen, and its position known or received."""
     if state.sight[world, vehicle, entry] != VISIBLE:

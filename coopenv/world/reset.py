@@ -211,6 +211,7 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
         state.outbox_tick[world, vehicle, slot] = -1
         state.outbox_position[world, vehicle, slot] = o
         state.outbox_rotation[world, vehicle, slot] = identity3(o)
+        state.outbox_std[world, vehicle, slot] = o[0]
         for other in range(state.outbox_seen.shape[3]):
             state.outbox_seen[world, vehicle, slot, other] = -1
             state.outbox_content[world, vehicle, slot, other] = NOTHING

@@ -377,6 +377,7 @@ def state_struct(p: Precision) -> Any:
 
         outbox_rotation: array("WNS", mat33, ROTATION)  # Rhat as sent
         outbox_position: array("WNS", vec3)  # Rhat phat as sent, map
+        outbox_std: array("WNS", scalar)  # standard deviation of that position, m; 0: none
         outbox_tick: array("WNS", wp.int32, TICK)  # -1: nothing sent in this slot
         outbox_seen: array("WNSH", wp.int32, TICK)  # ticks at which it last measured each vehicle, as sent; -1: never
         outbox_content: array("WNSH", wp.int32, whole(0, 2))  # per receiver: nothing, the pose alone, the whole report
@@ -385,6 +386,7 @@ def state_struct(p: Precision) -> Any:
         arriving: array("WNY", wp.int32, TICK)  # per receiver and box: sending tick of the arriving message; -1: none
         inbox_rotation: array("WNY", mat33, ROTATION)  # per receiver and box
         inbox_position: array("WNY", vec3)  # map
+        inbox_std: array("WNY", scalar)  # standard deviation of that position as sent, m
         inbox_tick: array("WNY", wp.int32, TICK)  # tick of sending; -1: nothing received
         inbox_stamp: array("WNY", wp.int32, TICK)  # the same by the receiver's clock
         inbox_pose_only: array("WNY", wp.int32, FLAG)  # whether the last message was the pose alone

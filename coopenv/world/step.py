@@ -20,7 +20,7 @@ from coopenv.world.embedded import Embedded, Now, Source, regular_tick
 from coopenv.world.launch import module_kernels
 from coopenv.world.model import Precision, model_struct
 from coopenv.world.nearby import sender_of
-from coopenv.world.quality import sample_gramian
+from coopenv.world.quality import sample_gramian, state_deviation
 from coopenv.world.state import array, state_struct
 from coopenv.world.v2x import broadcast as broadcast_estimate
 from coopenv.world.v2x import count_bytes, deliver, forget_everything
@@ -98,6 +98,7 @@ def _sending(send: Any) -> Any:
         """Send the estimate."""
         sample_gramian(model, state, world, vehicle, now.tick)
         broadcast_estimate(model, state, world, vehicle, now.tick)
+        state_deviation(state, world, vehicle, now.tick % model.radio.slots)
         send(model, state, memory, world, vehicle, now.tick)
         count_bytes(model, state, world, vehicle, now.tick)
 
@@ -312,6 +313,7 @@ def host_kernels(p: Precision) -> Kernels:
             tick = state.tick[world] + 1
             sample_gramian(model, state, world, vehicle, tick)
             broadcast_estimate(model, state, world, vehicle, tick)
+            state_deviation(state, world, vehicle, tick % model.radio.slots)
 
     def finish(model: Model, state: State, hold: Hold):
         """End the tick. One thread per world."""

@@ -340,6 +340,7 @@ def put_into_inbox(model: Any, state: Any, world: int, receiver: int, box: int, 
     slot = made % model.radio.slots
     state.inbox_rotation[world, receiver, box] = state.outbox_rotation[world, sender, slot]
     state.inbox_position[world, receiver, box] = state.outbox_position[world, sender, slot]
+    state.inbox_std[world, receiver, box] = state.outbox_std[world, sender, slot]
     state.inbox_tick[world, receiver, box] = sent
     state.inbox_stamp[world, receiver, box] = stamped
     if model.kept == 0:

@@ -56,7 +56,7 @@ BY_AGENT = {
     "bearing_tick": -1,
     "sight": Sight.NOT_A_NEIGHBOUR,
     **dict.fromkeys(("arriving", "inbox_tick", "inbox_stamp"), -1),
-    **dict.fromkeys(("inbox_rotation", "inbox_position"), 0.0),
+    **dict.fromkeys(("inbox_rotation", "inbox_position", "inbox_std"), 0.0),
 }
 """Fields of measurements and messages, and their values for an agent that is not kept."""
 Keys = Sequence[int | None] | np.ndarray | None

@@ -147,6 +147,7 @@ def _rows(value: Mapping[str, Any]) -> dict[tuple[str, str], dict[str, Any]]:
 
 
 def fingerprint(scenario: Scenario) -> str:
-    """Return a digest of a scenario's settings, without its texts and without defaults."""
-    settings = scenario.model_dump(mode="json", exclude_unset=True, exclude={"title", "description", "source"})
+    """Return a digest of a scenario's settings without defaults; figures depend neither on texts nor on the reward."""
+    unused = {"title", "description", "source", "reward"}
+    settings = scenario.model_dump(mode="json", exclude_unset=True, exclude=unused)
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]

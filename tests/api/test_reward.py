@@ -83,7 +83,7 @@ def test_gymnasium_hands_it_on() -> None:
     one = gymnasium.make("coopenv/UrbanCrossing-v0", reward=reward)
     one.reset(seed=0)
     assert one.step(np.zeros(2, np.float32))[1] == 7.0
-    rows = gymnasium.make_vec("coopenv/UrbanCrossing-v0", num_envs=4, reward=reward)
+    rows = gymnasium.make_vec("coopenv/UrbanCrossingRows-v0", num_envs=4, reward=reward)
     rows.reset(seed=0)
     assert (rows.step(np.zeros((4, 2), np.float32))[1] == 7.0).all()
 

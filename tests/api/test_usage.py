@@ -219,7 +219,7 @@ def test_registries_hold_names_of_coopenv_alone_and_make_any_scenario(scenario: 
     assert not {*coopenv.list_envs()} & {*gymnasium.registry, *pettingzoo.parallel_registry}
     made: Any = gymnasium.make("coopenv/Scenario-v0", name_or_path=scenario).unwrapped
     assert made.scenario == scenario
-    assert gymnasium.make_vec("coopenv/Scenario-v0", num_envs=5, name_or_path="ring:5").num_envs == 5
+    assert gymnasium.make_vec("coopenv/ScenarioRows-v0", num_envs=5, name_or_path="ring:5").num_envs == 5
     assert len(pettingzoo.make("parallel", "coopenv/Scenario-v0", name_or_path="ring:5").possible_agents) == 5
 
 

@@ -276,7 +276,7 @@ def test_states_of_other_scenarios_do_not_fit() -> None:
 def test_counts_may_be_of_numpy() -> None:
     env = coopenv.make_vec("busy_intersection", num_worlds=np.int64(2))
     assert type(env.num_envs) is int and env.reset(seed=0)[0].shape[0] == 10
-    assert gymnasium.make_vec("coopenv/BusyIntersection-v0", num_envs=np.int64(10)).num_envs == 10
+    assert gymnasium.make_vec("coopenv/BusyIntersectionRows-v0", num_envs=np.int64(10)).num_envs == 10
 
 
 def restored(env: coopenv.CooperativeVectorEnv) -> coopenv.CooperativeVectorEnv:

@@ -22,6 +22,7 @@ from tests.helpers.env_suite import first_episodes
 from tests.helpers.four_way import FOUR_WAY
 
 CROSSING = "coopenv/UrbanCrossing-v0"
+ROWS = "coopenv/UrbanCrossingRows-v0"
 
 
 def batch(**options: Any) -> coopenv.CooperativeVectorEnv:
@@ -113,11 +114,28 @@ def test_aec_goes_through_the_same_states_as_the_parallel_face() -> None:
 
 
 def test_make_vec_by_name() -> None:
-    env = gymnasium.make_vec(CROSSING, num_envs=8)
+    env = gymnasium.make_vec(ROWS, num_envs=8)
     assert env.num_envs == 8 and env.unwrapped.num_worlds == 2
     assert env.observation_space.shape == (8, *env.single_observation_space.shape)
     with pytest.raises(coopenv.CoopenvError, match="not a positive multiple of the 4 vehicles"):
-        gymnasium.make_vec(CROSSING, num_envs=9)
+        gymnasium.make_vec(ROWS, num_envs=9)
+
+
+def test_a_vector_of_an_id_has_one_vehicle_of_each_world_and_small_infos() -> None:
+    def step(**options: Any) -> tuple[Any, dict[str, Any]]:
+        env = gymnasium.make_vec(CROSSING, num_envs=3, **options)
+        observations, _ = env.reset(seed=[5, 6, 7])
+        *_, infos = env.step(np.zeros((3, 2), np.float32))
+        env.close()
+        return observations, infos
+
+    observations, infos = step()
+    for seed, row in zip((5, 6, 7), observations, strict=True):
+        np.testing.assert_array_equal(row, gymnasium.make(CROSSING).reset(seed=seed)[0])
+    assert {"position_error", "nees", "time"} <= {*infos} and not {"truth", "estimate", "reward_terms"} & {*infos}
+    assert all(values.dtype.kind in "biufO" for values in infos.values())
+    np.testing.assert_array_equal(step(vectorization_mode="sync")[1]["nees"], infos["nees"])
+    assert {"truth", "estimate", "reward_terms"} <= {*step(details=True)[1]}
 
 
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step", "disabled"])

@@ -15,10 +15,11 @@ from coopenv.base.errors import CoopenvError
 from coopenv.estimation import Outcome
 from coopenv.evaluation import METRICS, Episodes, compare_paired, drive, held_out_seeds, ranking_key, score
 from coopenv.evaluation.episodes import BLOCK_WORLDS, BLOCKS
-from coopenv.evaluation.metrics import LOST, Quantile, Ratio, interval, resamples, scored_errors
+from coopenv.evaluation.metrics import Quantile, Ratio, interval, resamples, scored_errors
 from coopenv.policies import load_agent
 from coopenv.policies.base import zero_policy
 from coopenv.runs import rollout
+from coopenv.scenario.terms import LOST
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.trips import trips
 

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
@@ -13,7 +14,9 @@ import coopenv
 from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.installation import data_directory
 from coopenv.policies import find_agent
+from coopenv.scenario import load_scenario
 from coopenv.training.settings import (
+    Ppo,
     Settings,
     TrainingPlan,
     check_settings,
@@ -112,7 +115,17 @@ def test_worlds_to_learn_in_mean_what_those_to_be_judged_in_mean(overrides: dict
 def test_tables_and_dotted_keys_are_the_same(path: Path) -> None:
     settings = read_settings(path)
     assert settings.scenario == {"reward.weights.position_error": 0.1, "rates.decision": 5.0}
-    assert (settings.ppo.vehicles, settings.ppo.gamma) == (8, 0.99)
+    assert (settings.ppo.vehicles, settings.ppo.gamma) == (8, None)
+
+
+def test_the_discount_follows_from_the_horizon() -> None:
+    """Without a given one, the last decision of an episode weighs 1 / e for the first."""
+    platoon = load_scenario("scout_platoon")
+    decisions = platoon.horizon * platoon.rates.decision
+    discount = Ppo().discount(platoon)
+    assert discount == 1.0 - 1.0 / decisions and discount**decisions == pytest.approx(np.exp(-1.0), rel=2e-3)
+    short = load_scenario("scout_platoon", {"horizon": 0.1})
+    assert 0.0 < Ppo().discount(short) < 1.0 and Ppo(gamma=0.9).discount(platoon) == 0.9
 
 
 def test_an_arm_changes_what_it_names(path: Path) -> None:

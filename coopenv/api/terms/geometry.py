@@ -4,8 +4,9 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.api.terms.records import Ego, MapLandmark, Neighbour, Target, TruthRecord, log10, mat66
+from coopenv.api.terms.records import NEVER, Ego, MapLandmark, Neighbour, Target, TruthRecord, log10, mat66
 from coopenv.motions.command import ACCELERATION, SPEED, TURN
+from coopenv.scenario import terms
 from coopenv.world.camera import (
     VISIBLE,
     behind_building,
@@ -32,15 +33,16 @@ from coopenv.world.nearby import (
     sender_of,
 )
 from coopenv.world.quality import position_covariance
-from coopenv.world.referee import ARRIVED
+from coopenv.world.referee import ARRIVED, COLLIDED, OFF_ROUTE
 from coopenv.world.route import UNDER_WAY, goal_distance, place_on_route, point_on_route, route_length
-from coopenv.world.v2x import fresh
+from coopenv.world.v2x import POSE_BYTES, fresh
 from coopenv.world.warp_internals import device_function
 
+HALF_TICK = wp.constant(1.0e-3)
+"""Less than half of the time between two camera ticks, s."""
+SETTLED_FROM = wp.constant(terms.SETTLED_FROM)
 FASTEST = wp.constant(wp.float64(2.0))
 """Largest gain of progress per time, in multiples of the top speed (the inside of a bend is shorter)."""
-NEVER = wp.constant(wp.float64(1.0e9))
-"""Age without any measurement or message, s."""
 
 
 @device_function
@@ -111,6 +113,33 @@ def metres(model: Any, state: Any, results: Any, world: int, vehicle: int, progr
     return gained, missed
 
 
+@device_function
+def lost_time(model: Any, state: Any, results: Any, world: int, vehicle: int) -> wp.float32:
+    """Return the time (s) for which a vehicle counts as lost after the end of its episode, as the score defines it.
+
+    It is the rest of the way at the mean pace so far, at most the duration of an episode; without a goal, or after an
+    arrival, the rest of the episode. Of all other steps it is 0. The time before `SETTLED_FROM` does not count. See
+    `coopenv.evaluation.episodes.Episodes.lost_for`.
+    """
+    ends = results.alive[world, vehicle] and (results.terminated[world, vehicle] or results.truncated[world, vehicle])
+    outcome = state.ended[world, vehicle]
+    has_goal = wp.float32(model.scene.goal_radius[vehicle]) > 0.0
+    to_goal = has_goal and model.scene.end_on_arrival == 1 and state.arrivals[world, vehicle] == 0
+    left_or_hit = wp.where(outcome == COLLIDED, True, outcome == OFF_ROUTE)
+    if not ends or not (to_goal or left_or_hit):
+        return 0.0
+    decision = wp.float32(model.ticks_per_decision) / wp.float32(model.camera_rate)
+    made = wp.ceil(wp.float32(state.tick[world]) / wp.float32(model.ticks_per_decision))
+    all_of_them = wp.ceil(wp.float32(model.horizon_ticks) / wp.float32(model.ticks_per_decision))
+    rest = all_of_them - made
+    if to_goal:
+        length = wp.max(wp.float32(route_length(state, world, vehicle)), 1.0e-6)
+        left = wp.clamp(wp.float32(goal_distance(model, state, world, vehicle)) / length, 0.0, 1.0)
+        rest = wp.min(made * left / wp.max(1.0 - left, 1.0e-6), all_of_them)
+    early = wp.max(wp.ceil(SETTLED_FROM / decision - 1.0e-4) - 1.0 - made, 0.0)
+    return decision * wp.max(wp.max(wp.round(rest), 1.0) - early, 0.0)
+
+
 @wp.func
 def zero_if_unknown(value: Any) -> wp.float32:
     """Return a quantity of the truth, 0 in a recording without it."""
@@ -120,14 +149,14 @@ def zero_if_unknown(value: Any) -> wp.float32:
 @wp.func
 def seconds_since(now: int, then: int, rate: wp.float64) -> wp.float32:
     """Return the age in s of a measurement or message by its tick; `NEVER` without one."""
-    return wp.float32(wp.where(then < 0, NEVER, wp.float64(now - then) / rate))
+    return wp.where(then < 0, NEVER, wp.float32(wp.float64(now - then) / rate))
 
 
 @wp.func
 def odometry_age(samples: int, time: wp.float64, rate: wp.float64) -> wp.float32:
     """Return the age in s of the last of so many samples, the first of which was at 0 s."""
     age = wp.max(time - wp.float64(samples - 1) / rate, wp.float64(0.0))
-    return wp.float32(wp.where(samples == 0, NEVER, age))
+    return wp.where(samples == 0, NEVER, wp.float32(age))
 
 
 @device_function
@@ -138,6 +167,7 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     route that is left, m. Without `route`, the fields `route_offset` to `route_ahead` stay 0.
     """
     ego = Ego()
+    ego.number = vehicle
     tick = state.tick[world]
     time = wp.float64(tick) / model.camera_rate
     ego.time = wp.float32(time)
@@ -220,6 +250,9 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
             nearer += route_length(state, world, vehicle)
         truth.progress = zero_if_unknown(nearer)
     truth.contact = state.collided[world, vehicle] != 0
+    if results.alive[world, vehicle] and ego.time >= SETTLED_FROM - HALF_TICK:
+        truth.scored_time = ego.elapsed
+    truth.lost_time = lost_time(model, state, results, world, vehicle)
     return ego, truth
 
 
@@ -240,7 +273,7 @@ def target_record(model: Any, state: Any, world: int, vehicle: int, n: int) -> T
         entry = kept_entry(state, world, vehicle, n)
     if entry < 0:
         target.index = -1
-        target.age = wp.float32(NEVER)
+        target.age = NEVER
     else:
         target.index = agent_of(state, model.kept, world, vehicle, entry)
         target.bearing = wp.vec3(body_bearing(model, state, world, vehicle, entry))
@@ -262,10 +295,12 @@ def neighbour_record(model: Any, state: Any, world: int, vehicle: int, entry: in
     """Return the record of another vehicle; without an entry (-1) its index is -1."""
     neighbour = Neighbour()
     now = state.tick[world]
-    neighbour.age = wp.float32(NEVER)
+    neighbour.age = NEVER
+    neighbour.std = float(wp.inf)
     if entry < 0:
         neighbour.index = -1
-        neighbour.bearing_age = wp.float32(NEVER)
+        neighbour.bearing_age = NEVER
+        neighbour.seen_age = NEVER
         return neighbour
     box = box_of_entry(model, entry)
     target = agent_of(state, model.kept, world, vehicle, entry)
@@ -278,6 +313,10 @@ def neighbour_record(model: Any, state: Any, world: int, vehicle: int, entry: in
         neighbour.position = wp.vec3(Rt * state.inbox_position[world, vehicle, box] - p)
         neighbour.rotation = wp.mat33(Rt * state.inbox_rotation[world, vehicle, box])
         neighbour.age = seconds_since(now, state.inbox_stamp[world, vehicle, box], model.camera_rate)
+        std = wp.float32(state.inbox_std[world, vehicle, box])
+        reports = state.inbox_pose_only[world, vehicle, box] == 0 and state.report_size[world, sender] > POSE_BYTES
+        if reports and std > 0.0:
+            neighbour.std = std
     neighbour.precedes = neighbour.received and (sender < vehicle or model.motion.kind[target] != DRIVEN)
     seen = state.inbox_seen[world, vehicle, box]
     neighbour.sees = neighbour.received and seen == state.inbox_stamp[world, vehicle, box]
@@ -377,7 +416,7 @@ def next_landmark(model: Any, state: Any, world: int, vehicle: int, last: MapLan
     """
     landmark = MapLandmark()
     landmark.index = -1
-    landmark.age = wp.float32(NEVER)
+    landmark.age = NEVER
     if last.index < 0 and last.distance >= 0.0:
         return landmark  # `last` was the end of the map
     R = state.estimate_rotation[world, vehicle]

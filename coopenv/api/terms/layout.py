@@ -124,6 +124,8 @@ def entries_of(row: ObservationField, scenario: Scenario) -> tuple[int, ...]:
     """Return the entries of a field's value that a scenario's observation holds."""
     if row is OBSERVATION_FIELDS.built_in["last_action"]:
         return tuple(range(min(row.size, scenario.columns + (scenario.action.pan is not None))))
+    if row is OBSERVATION_FIELDS.built_in["role"]:
+        return tuple(range(min(row.size, len(scenario.vehicles))))
     if row.scale in COLUMNS_OBSERVED and not _spans(scenario, str(row.scale)):
         return ()
     if scenario.observation.planar and row.planar is not None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.scenario import terms
 from coopenv.scenario.terms import OBSERVATION_FIELDS
 
 LOG10_E = wp.constant(0.4342944819032518)
@@ -23,6 +24,9 @@ FAR = wp.constant(4.0)
 """Upper bound of the closest approach, m; also its value without a message."""
 DEGREES = wp.constant(57.29577951308232)
 EIGENVALUE_FLOOR = wp.constant(1.0e-9)
+NEVER = wp.constant(1.0e9)
+"""Age without any measurement or message, s."""
+ROLES = wp.constant(terms.ROLES)
 
 mat66 = wp.types.matrix((6, 6), wp.float32)
 
@@ -31,6 +35,7 @@ mat66 = wp.types.matrix((6, 6), wp.float32)
 class Ego:
     """The vehicle's own estimate, odometry, action and route."""
 
+    number: wp.int32  # of the vehicle in the fleet, from 0
     time: wp.float32  # s since the reset
     elapsed: wp.float32  # s since the last decision
     position_estimate: wp.vec3  # m, map
@@ -90,6 +95,8 @@ class TruthRecord:
     goal_distance: wp.float32  # m, horizontal
     progress: wp.float32  # decrease of the remaining route in this decision, m; 0 without a goal
     contact: wp.bool  # touching a building or another body now
+    scored_time: wp.float32  # s of this decision for which the position error counts in the score
+    lost_time: wp.float32  # s for which the vehicle counts as lost after the step that ends its episode; else 0
 
 
 @wp.struct
@@ -121,6 +128,7 @@ class Neighbour:
     received: wp.bool  # there is a message and it is not stale
     position: wp.vec3  # m, sender's estimate relative to the vehicle's own, body
     rotation: wp.mat33  # sender's body to the vehicle's own estimated body
+    std: wp.float32  # m, standard deviation of its position that it states; inf: no report at hand
     age: wp.float32  # s since it was sent
     bearing: wp.vec3  # unit vector camera to the vehicle, body, last measured; 0: never
     in_view: wp.bool  # measured in this frame
@@ -163,6 +171,12 @@ def put(values: Any, place: int, vector: Any):
     for k in range(len(vector)):
         values[place + k] = vector[k]
     return values
+
+
+@wp.func
+def found(age: wp.float32) -> wp.float32:
+    """Return 1 for the age in s of something that was measured in this episode, otherwise 0."""
+    return wp.where(age < NEVER, 1.0, 0.0)
 
 
 @wp.func
@@ -243,6 +257,8 @@ def vehicle_values(ego: Ego) -> VehicleValues:
     values = put(values, FieldPlace.last_action, ego.action)
     values[FieldPlace.time_left] = ego.time_left
     values[FieldPlace.camera_pan] = ego.pan
+    if ego.number < ROLES:
+        values[FieldPlace.role + ego.number] = 1.0
     return values
 
 
@@ -253,6 +269,7 @@ def target_values(target: Target) -> TargetValues:
     values = put(values, FieldPlace.bearing, target.bearing)
     values[FieldPlace.bearing_mask] = wp.float32(target.in_view)
     values[FieldPlace.bearing_age] = target.age
+    values[FieldPlace.bearing_found] = found(target.age)
     return values
 
 
@@ -277,6 +294,9 @@ def neighbour_values(ego: Ego, neighbour: Neighbour, clearance: bool) -> Neighbo
     values[FieldPlace.sighting_age] = neighbour.bearing_age
     values[FieldPlace.seen_mask] = wp.float32(neighbour.sees)
     values[FieldPlace.seen_age] = neighbour.seen_age
+    values[FieldPlace.message_std] = log10_of_std(neighbour.std)
+    values[FieldPlace.sighting_found] = found(neighbour.bearing_age)
+    values[FieldPlace.seen_found] = found(neighbour.seen_age)
     return values
 
 
@@ -288,4 +308,5 @@ def landmark_values(landmark: MapLandmark) -> LandmarkValues:
     values[FieldPlace.map_mask] = wp.float32(landmark.exists)
     values[FieldPlace.map_in_view] = wp.float32(landmark.expected)
     values[FieldPlace.map_age] = landmark.age
+    values[FieldPlace.map_found] = found(landmark.age)
     return values

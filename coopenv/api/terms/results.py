@@ -39,7 +39,7 @@ from coopenv.api.terms.records import (
     vehicle_values,
 )
 from coopenv.estimation.linalg import rotation_angle
-from coopenv.scenario import Scenario
+from coopenv.scenario import Scenario, terms
 from coopenv.scenario.terms import OBSERVATION_FIELDS, READINGS, REWARD_TERMS
 from coopenv.world.model import DRIVEN, Precision
 from coopenv.world.quality import (
@@ -234,6 +234,7 @@ def is_over(model: Any, state: Any, world: int) -> bool:
     return True
 
 
+LOST = wp.constant(terms.LOST)
 RewardValues = wp.types.vector(len(REWARD_TERMS.built_in), wp.float32)
 RewardPlace: Any = IntEnum("RewardPlace", {name: place for place, name in enumerate(REWARD_TERMS.built_in)})
 """Place of a built-in reward term by its name, for kernels."""
@@ -262,6 +263,8 @@ def reward_values(ego: Ego, truth: TruthRecord) -> RewardValues:
     values[RewardPlace.radio] = -0.001 * wp.float32(ego.bytes_sent)
     values[RewardPlace.position_error] = -truth.position_error
     values[RewardPlace.orientation_error] = -(truth.orientation_error / DEGREES)
+    scored = wp.min(truth.position_error, LOST) * truth.scored_time
+    values[RewardPlace.scored_error] = -(scored + LOST * truth.lost_time)
     values[RewardPlace.position_uncertainty] = per_metre(ego, ego.position_std - threshold, cap)
     values[RewardPlace.position_error_per_metre] = per_metre(ego, truth.position_error - threshold, cap)
     values[RewardPlace.information_gain] = ego.information_gained

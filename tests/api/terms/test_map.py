@@ -359,3 +359,50 @@ def test_messages_show_which_vehicles_measure_the_receiver() -> None:
             assert age[w, i, n] == pytest.approx((now - measured[-1]) / 30 if measured else 1000.0, abs=1e-3)
             masks += int(mask[w, i, n])
     assert 100 < masks < 900
+
+
+def test_reports_state_how_well_the_sender_knows_its_position() -> None:
+    radio = {"v2x.delay": 3, "v2x.period": 2, "v2x.loss": 0.3, "v2x.links": "all", "v2x.staleness": 0.2}
+    scenario = load_scenario("scout_platoon", {**radio, "observation.include": ["stated"]})
+    engine = Engine(scenario, 3, "float64")
+    engine.reset([5, 6, 7])
+    stated, unknown = [engine.view("position_std").copy()], 0
+    for now in range(1, 60):
+        engine.step(np.tile([0.5, 0.1], (3, 3, 1)), ticks=1)
+        stated.append(engine.view("position_std").copy())
+        values = seen(engine, scenario, "message_std")
+        for w, i, n in np.ndindex(3, 3, 2):
+            sender = n + (n >= i)
+            sent = int(engine.view("inbox_tick")[w, i, sender])
+            at_hand = sent > 0 and now - sent <= 6  # the first message, of the start, states none
+            expected = np.log10(stated[sent][w, sender]) if at_hand else 0.25  # the end of its range
+            assert values[w, i, n] == pytest.approx(expected, abs=1e-5)
+            unknown += not at_hand
+    assert 10 < unknown < 900
+    silent = Engine(load_scenario("scout_platoon", {"observation.include": ["stated"], "observer.name": "riccati"}), 1)
+    silent.reset([5])
+    silent.step(np.zeros((1, 3, 2)))
+    assert (silent.view("observation") == 1.0).all(), "a pose alone states nothing"
+
+
+def test_what_was_never_measured_is_not_found() -> None:
+    """An age reads the same for what was measured longer ago than its scale, and for what was never measured."""
+    fields = ["bearings", "sightings", "map", "seen", "found", "role"]
+    scenario = load_scenario("scout_platoon", {"observation.include": fields, "observation.age_scale": 0.5})
+    engine = Engine(scenario, 3)
+    engine.reset([5, 6, 7])
+    ever = np.zeros_like(seen(engine, scenario, "bearing_found"), dtype=bool)
+    for _ in range(60):
+        ever |= engine.view("sight") == Sight.VISIBLE
+        found = {name: seen(engine, scenario, f"{name}_found") for name in ("bearing", "sighting", "map", "seen")}
+        np.testing.assert_array_equal(found["bearing"], ever)
+        for name, flags in found.items():
+            assert flags[seen(engine, scenario, f"{name}_age") < 0.499].all(), name
+        engine.step(np.tile([0.5, 0.2], (3, 3, 1)), ticks=3)
+    old = seen(engine, scenario, "bearing_age") > 0.499
+    assert found["bearing"][old].any() and not found["bearing"].all() and found["seen"].any() and found["map"].any()
+    others = [[2, 3], [1, 3], [1, 2]]
+    places = np.array(others) + len(scenario.landmarks) - 1
+    cars = np.take_along_axis(found["bearing"], np.broadcast_to(places, (3, 3, 2)), axis=2)
+    np.testing.assert_array_equal(found["sighting"], cars)
+    np.testing.assert_array_equal(seen(engine, scenario, "role"), np.broadcast_to(np.eye(3), (3, 3, 3)))

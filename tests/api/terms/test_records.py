@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 from coopenv.api.terms import records, results
-from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
+from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS, ROLES
 from coopenv.world.referee import COLLIDED
 
 
@@ -82,7 +82,8 @@ def loaded_again(module: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleT
 def test_values_follow_their_rows_to_other_places(monkeypatch: pytest.MonkeyPatch) -> None:
     expected = computed(records, results)
     zero = {name for name, entries in expected.items() if not all(entries)}
-    assert zero == {"reward.off_route"}  # every other value is written
+    assert zero == {"reward.off_route", "role"}  # every other value is written
+    assert expected["role"] == [float(place == 1) for place in range(ROLES)]  # of vehicle 1
     for terms in (OBSERVATION_FIELDS, REWARD_TERMS):
         monkeypatch.setattr(terms, "built_in", dict(reversed(terms.built_in.items())))
     records_of_reversed, results_of_reversed = (loaded_again(module, monkeypatch) for module in (records, results))
