@@ -6,7 +6,7 @@ APT := apt-get install --yes --no-install-recommends
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo svea-demo test test-nats test-ros1 test-train test-sumo agents test-all test-matrix test-browser docs site-version notebooks names lint format bench stages cuda-check gpu schema pages clean
+.PHONY: help demo svea-demo test test-nats test-ros1 test-train test-sumo agents interoperability test-all test-matrix test-browser docs site-version notebooks names lint format bench stages cuda-check gpu schema pages clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -84,6 +84,9 @@ study: $(VENV)/.study ## compare methods of learning, about an hour; goes on whe
 test-sumo: $(VENV)/.dev ## the tests that need SUMO (250 MB)
 	@$(PIP) --editable '.[sumo]'
 	@$(BIN)/python -m pytest -k sumo tests/sumo tests/sources tests/test_envs.py
+
+interoperability: $(VENV)/.base ## first examples of other projects with coopenv, each in its own environment (4 GB); writes docs/interoperability.md
+	@$(BIN)/python -m benchmarks.interoperability --page docs/interoperability.md
 
 test-all: lint ## every test whose tools are installed
 	@$(BIN)/python -m pytest -n 2 --dist loadfile

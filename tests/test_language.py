@@ -9,8 +9,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-GENERATED = (DOCS / "environments", DOCS / "reference" / "api")
-"""Pages that `sitegen.environments` writes, and those that `mkdocstrings` fills."""
+GENERATED = (DOCS / "environments", DOCS / "reference" / "api", DOCS / "interoperability.md")
+"""Pages that programs write, and those that `mkdocstrings` fills."""
 PAGES = {
     page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8")
     for page in sorted((*ROOT.glob("*.md"), *ROOT.glob("agents/*/card.md"), *DOCS.rglob("*.md")))

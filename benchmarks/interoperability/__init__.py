@@ -1,0 +1,1 @@
+"""First examples of other projects, with coopenv."""
