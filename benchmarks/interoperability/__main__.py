@@ -92,7 +92,7 @@ def installed(packages: Sequence[str], folder: Path) -> Path:
         pinned = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
         (place / "torch.txt").write_text("\n".join(line for line in pinned if line.startswith("torch==")))
         pip = (python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check")
-        command = (*pip, "--constraint", place / "torch.txt", *wanted)
+        command = [*map(str, pip), "--constraint", str(place / "torch.txt"), *wanted]
         made = subprocess.run(command, capture_output=True, text=True, check=False)
         if made.returncode:
             raise RuntimeError(last_line(made.stderr))
