@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-GUESTS = ("cars", "foxglove", "highway", "mrclam", "sumo")
+GUESTS = ("cars", "foxglove", "highway", "lanes", "mrclam", "sumo")
 """Wings of the package that do not count as its core."""
 TOPS = ("benchmarks", "examples", "sitegen", "tests")
 MOST = 15

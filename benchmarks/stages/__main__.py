@@ -51,9 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         out.print(whole_table(asked, overrides, log))
         out.print()
-        if asked.against is None:
+        if asked.against is None and not asked.lanes:
             out.print(stage_table(asked, SENSED | overrides, log))
-        elif asked.compiles:
+        elif asked.against is not None and asked.compiles:
             out.print(compile_table(asked, log))
     except CoopenvError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -71,6 +71,9 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--rounds", type=at_least(1), default=9, help="of which the median counts (default: 9)")
     found.add_argument("--decisions", type=at_least(1), default=10, help="per round (default: 10)")
     found.add_argument("--against", type=Path, metavar="DIR", help="another checkout: whole ticks of both, in turn")
+    found.add_argument(
+        "--lanes", action="store_true", help="whole ticks without worlds in lanes and with them, in turn"
+    )
     found.add_argument("--compiles", type=at_least(0), default=1, help="of each kind, from an empty cache (default: 1)")
     return found
 
@@ -78,11 +81,14 @@ def parser() -> argparse.ArgumentParser:
 def whole_table(asked: argparse.Namespace, extra: dict[str, Any], log: Console) -> Table:
     """Return the cost of steps of `make_vec` in some environments, of this checkout or of another one and this."""
     cases = [Case(name, asked.worlds, asked.dtype, {**overrides, **extra}) for name, overrides in TOTALS]
-    checkouts = {"other": asked.against.resolve(), "this": HERE} if asked.against else {"this": HERE}
-    more = ["this / other", "middle half\nof rounds"] if asked.against else []
-    table = Table.of_texts(["make_vec"], [*checkouts, *more])
+    other, this = "lanes off" if asked.lanes else "other", "lanes on" if asked.lanes else "this"
+    compared = asked.against is not None or asked.lanes
+    before = asked.against.resolve() if asked.against else HERE
+    heads = [other, this, f"{this} / {other}", "middle half\nof rounds"] if compared else [this]
+    table = Table.of_texts(["make_vec"], heads)
     with ExitStack() as stack:
-        sides = [stack.enter_context(Side(checkout, cases)) for checkout in checkouts.values()]
+        sides = [stack.enter_context(Side(before, cases, COOPENV_LANES="0"))] if compared else []
+        sides.append(stack.enter_context(Side(HERE, cases, COOPENV_LANES=str(int(asked.lanes)))))
         with Progress(log, "building"):
             for side in sides:
                 side.wait()
@@ -90,7 +96,7 @@ def whole_table(asked: argparse.Namespace, extra: dict[str, Any], log: Console) 
             for n, case in enumerate(cases):
                 times = 1e9 * alternate([partial(side.step, n, asked.decisions) for side in sides], asked.rounds)
                 cells = [f"{value:.0f}" for value in np.median(times, axis=0)]
-                if asked.against:
+                if compared:
                     share, low, high = ratio(times[:, 1], times[:, 0])
                     cells += [f"{share:.3f}", f"{low:.3f}..{high:.3f}"]
                 table.add(case.name, *cells)

@@ -48,8 +48,8 @@ class Case:
 class Side:
     """A process that steps the cases with the coopenv of one checkout."""
 
-    def __init__(self, checkout: Path, cases: Sequence[Case]) -> None:
-        """Start it; `wait` before the first request.
+    def __init__(self, checkout: Path, cases: Sequence[Case], **more: str) -> None:
+        """Start it, with more environment variables; `wait` before the first request.
 
         Raises:
             CoopenvError: there is no coopenv.
@@ -60,7 +60,7 @@ class Side:
             [sys.executable, "-P", str(SIDE), json.dumps([asdict(case) for case in cases])],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env=variables(checkout),
+            env=variables(checkout, **more),
             cwd=checkout,
             text=True,
         )

@@ -163,13 +163,13 @@ def occlusion(model: Any, state: Any, world: int, observer: int, target: int, or
     x, y, columns, rows = window_about(model, origin, origin + direction, state.body_reach[world])
     for row in range(rows):
         for column in range(columns):
-            item = first_in(state, world, cell_at(model, x + column, y + row), last)
+            item = first_in(model, state, world, cell_at(model, x + column, y + row))
             while item >= 0:
                 if item != observer and item != target and has_body(model, state, world, item):
                     R, center, half = body_of(model, state, world, item)
                     if segment_hits_box(origin, direction, inverse_square, R, center, half):
                         return OCCLUDED_BY_BODY
-                item = next_in(state, world, item, last)
+                item = next_in(model, state, world, item, last)
     return VISIBLE
 
 

@@ -152,6 +152,7 @@ class Source:
     knows_truth: bool = True  # the truth is always there; otherwise it may be NaN
     keeps_nearby: bool = False  # whether `topology.most_nearby` may limit what a vehicle keeps
     fused: bool = False  # whether small observers run in one kernel with it, see `Embedded.fused`
+    in_lanes: tuple[Any, ...] = ()  # stages that take several worlds at once in that kernel
 
 
 @device_function
@@ -236,6 +237,7 @@ SIMULATED = Source(
     lambda p: Nothing,
     keeps_nearby=True,
     fused=True,
+    in_lanes=(measure_odometry, referee, observe, transmit),
 )
 """Ticks that are computed."""
 

@@ -27,7 +27,7 @@ import warp as wp
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.files import lock, muted_errors
 from coopenv.base.installation import available_cores
-from coopenv.world.warp_internals import cpu_features, field_types, replay_of
+from coopenv.world.warp_internals import cpu_features, field_types, lanes_guest, replay_of
 
 ATTEMPTS = 3
 """Attempts to load a module: the second rebuilds it, the third is for two processes that rebuild the same one."""
@@ -232,6 +232,20 @@ def threads_and_lanes(worlds: int, vehicles: int, device: str, threads: int | No
     if min(by_vehicle, most) > min(by_world, most):
         return 1, min(by_vehicle, most)
     return max(min(by_world, most), 1), 1
+
+
+def computes_lanes(device: str, precision_name: str) -> bool:
+    """Return whether kernels of a device and precision can take several worlds at once (`coopenv.lanes`)."""
+    if device != "cpu" or precision_name != "float32" or lanes_guest() is None:
+        return False
+    start_warp()
+    return cpu_features() >= X86_64_V3
+
+
+def width_of_lanes(device: str, precision_name: str) -> int:
+    """Return how many worlds kernels take at once, if COOPENV_LANES is 1; 0: they take them one by one."""
+    wanted = os.environ.get("COOPENV_LANES", "") == "1" and computes_lanes(device, precision_name)
+    return int(lanes_guest().WIDTH) if wanted else 0
 
 
 @dataclass(frozen=True)

@@ -65,17 +65,17 @@ def last_of_all(model: Any) -> int:
 
 
 @wp.func
-def first_in(state: Any, world: int, cell: int, last: int) -> int:
-    """Return the first item of a cell; -1: none. `last` is the grid's, read once per window."""
-    if last >= 0:
+def first_in(model: Any, state: Any, world: int, cell: int) -> int:
+    """Return the first item of a cell; -1: none."""
+    if model.cells.across == 1:
         return 0
     return state.first_item[world, cell]
 
 
 @wp.func
-def next_in(state: Any, world: int, item: int, last: int) -> int:
-    """Return the item that follows one in its cell; -1: none. `last` as for `first_in`."""
-    if last >= 0:
+def next_in(model: Any, state: Any, world: int, item: int, last: int) -> int:
+    """Return the item that follows one in its cell; -1: none. `last` is the grid's, read once per window."""
+    if model.cells.across == 1:
         return wp.where(item < last, item + 1, -1)
     return state.next_item[world, item]
 
@@ -335,10 +335,10 @@ def keep_those_in_range(model: Any, state: Any, world: int, vehicle: int):
     x, y, columns, rows = window_about(model, here, here, wp.max(seen, model.radio.range))
     for row in range(rows):
         for column in range(columns):
-            agent = first_in(state, world, cell_at(model, x + column, y + row), last)
+            agent = first_in(model, state, world, cell_at(model, x + column, y + row))
             while agent >= 0:
                 if agent < model.agents and agent != own:
                     if is_target(model, vehicle, agent) or model.radio.to_all == 1:
                         if beyond(model, state, world, vehicle, agent, seen) <= seen - seen:
                             keep(model, state, world, vehicle, agent, seen)
-                agent = next_in(state, world, agent, last)
+                agent = next_in(model, state, world, agent, last)

@@ -85,14 +85,14 @@ def touches_one_of(model: Any, state: Any, world: int, vehicle: int, count: int)
             cell = cell_at(model, x + column, y + row)
             if touches_building_of(model, cell, center, R, half):
                 return 1
-            item = first_in(state, world, cell, last)
+            item = first_in(model, state, world, cell)
             while item >= 0:
                 counts = item < count or count == model.agents
                 if counts and item != agent and has_body(model, state, world, item):
                     other_R, other_center, other_half = body_of(model, state, world, item)
                     if boxes_touch(center, R, half, other_center, other_R, other_half):
                         return 1
-                item = next_in(state, world, item, last)
+                item = next_in(model, state, world, item, last)
     return 0
 
 

@@ -332,7 +332,7 @@ def gap_ahead(model: Any, state: Any, world: int, vehicle: int, s: Any, front: A
     x, y, columns, rows = window_about(model, here, here, reach)
     for row in range(rows):
         for column in range(columns):
-            item = first_in(state, world, cell_at(model, x + column, y + row), last)
+            item = first_in(model, state, world, cell_at(model, x + column, y + row))
             while item >= 0:
                 if item != agent and has_body(model, state, world, item):
                     R, center, other = body_of(model, state, world, item)
@@ -349,7 +349,7 @@ def gap_ahead(model: Any, state: Any, world: int, vehicle: int, s: Any, front: A
                             speed = type(s)(0.0)
                             if item < model.agents:
                                 speed = wp.max(c * state.velocity[world, item][0], type(s)(0.0))
-                item = next_in(state, world, item, last)
+                item = next_in(model, state, world, item, last)
     return gap, speed
 
 

@@ -24,7 +24,7 @@ from coopenv.world.quality import sample_gramian, state_deviation
 from coopenv.world.state import array, state_struct
 from coopenv.world.v2x import broadcast as broadcast_estimate
 from coopenv.world.v2x import count_bytes, deliver, forget_everything
-from coopenv.world.warp_internals import device_function, host_only
+from coopenv.world.warp_internals import device_function, host_only, lanes_guest
 
 Kernels = dict[str, wp.Kernel]
 """Kernels by name."""
@@ -265,8 +265,12 @@ def observer_kernels(observer: Embedded, p: Precision) -> Kernels:
 
 
 @cache
-def fused_kernels(source: Source, observer: Embedded, p: Precision) -> Kernels:
-    """Return `begin`, and `advance`, which runs whole decisions of a source and an observer."""
+def fused_kernels(source: Source, observer: Embedded, p: Precision, lanes: str | None = None) -> Kernels:
+    """Return `begin`, and `advance`, which runs whole decisions of a source and an observer.
+
+    With `lanes` the latter takes several worlds at once, at least `coopenv.lanes.WIDTH`; "cell": their grid has a
+    single cell, "grid": any number. Few worlds start at once.
+    """
     Model, State, Memory, Record = model_struct(p), state_struct(p), observer.memory, source.record(p)
     sense_tick, follow_tick = _sense_tick(source), _in_turn(receive_messages, *observer.parts, _sending(observer.send))
 
@@ -292,7 +296,12 @@ def fused_kernels(source: Source, observer: Embedded, p: Precision) -> Kernels:
                 follow_tick(model, state, memory, world, model.order[place], now)
             finish_tick(model, state, world, tick)
 
-    return module_kernels(f"{source.name}_{observer.name}", p, _begin(source, p), advance, **observer.options)
+    name, options = f"{source.name}_{observer.name}", dict(observer.options)
+    if lanes is not None:
+        stages = (*source.in_lanes, deliver, *observer.parts, sample_gramian, broadcast_estimate, count_bytes)
+        name, functions = f"{name}_{lanes}_in_lanes", (f.func.__name__ for f in stages)
+        options["in_lanes"] = lanes_guest().lanes_option("advance", functions, grid=lanes == "grid")
+    return module_kernels(name, p, _begin(source, p), advance, **options)
 
 
 @cache

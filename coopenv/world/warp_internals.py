@@ -9,19 +9,22 @@
 | `cpu_features` | `context._get_cpu_feature_set` | the processor, as LLVM names it |
 | `_kernel_source` | `codegen.codegen_kernel`, `Adjoint.args` | no copies of records; no kernels of the host on CUDA |
 | `_function_source` | `codegen.codegen_func`, `codegen.cpu_module_header` | CPU: indices and loops as in C |
+| `_module_source` | `ModuleBuilder.codegen`, `ModuleBuilder.options` | CPU: several worlds at once |
 
-The last two stand in Warp for the whole process. Kernels and functions of other modules get the source that Warp gives
-them; all that their modules have more is the namespace `coopenv`, with one template.
+The last three stand in Warp for the whole process. Kernels and functions of other modules get the source that Warp
+gives them; all that their modules have more is the namespace `coopenv`, with one template.
 """
 
 import ctypes
 import re
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import warp as wp
 from warp._src import codegen, context
+
+from coopenv.base.plugins import loaded, own
 
 
 def cpu_features() -> frozenset[str]:
@@ -133,6 +136,28 @@ def _kernel_source(kernel: Any, device: str, options: Mapping[str, Any]) -> str:
 
 
 codegen.codegen_kernel = _kernel_source
+
+
+@cache
+def lanes_guest() -> Any:
+    """Return the guest that lets kernels of a CPU take several worlds at once; None: there is none."""
+    point = own("coopenv.lanes").get("cpu")
+    return None if point is None else loaded(point, "lanes")
+
+
+_generate_module: Any = context.ModuleBuilder.codegen
+
+
+def _module_source(builder: Any, device: str) -> str:
+    """Return the source of a module; one with the option `in_lanes` takes several worlds at once on the CPU."""
+    source: str = _generate_module(builder, device)
+    wanted = builder.options.get("in_lanes")
+    if wanted and device == "cpu" and wp.config.mode != "debug":
+        source = lanes_guest().in_lanes(source, wanted)
+    return source
+
+
+context.ModuleBuilder.codegen = _module_source  # type: ignore[method-assign]
 
 
 def host_only(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -15,7 +15,15 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.difficulty import PARAMETERS
 from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
-from coopenv.world.launch import VEHICLES_PER_LEVEL, Call, Launcher, PerLane, PerWorld, threads_and_lanes
+from coopenv.world.launch import (
+    VEHICLES_PER_LEVEL,
+    Call,
+    Launcher,
+    PerLane,
+    PerWorld,
+    threads_and_lanes,
+    width_of_lanes,
+)
 from coopenv.world.model import check_device, device_memory, mat66d, precision
 from coopenv.world.quality import COORDINATES
 from coopenv.world.random import NOT_SET
@@ -67,7 +75,8 @@ class World:
     """`worlds` copies of one scenario, stepped together.
 
     The draws of a world depend on its key alone (`coopenv.base.seeds`): it is bit for bit the single world with that
-    key (on the same device).
+    key (on the same device). In lanes (`in_lanes`) this holds for the truth; measurements and estimates are equal
+    within rounding, and bit for bit in any other batch in lanes.
     """
 
     source: Source = SIMULATED  # where its ticks come from
@@ -111,6 +120,9 @@ class World:
         N = self.model.vehicles
         shares, lanes = threads_and_lanes(worlds, N, self.device, threads)
         self.threads = max(shares, lanes) if self.device == "cpu" else 1
+        width = width_of_lanes(self.device, dtype)
+        fits = 0 < width <= worlds and self.model.kept == 0
+        shares = min(shares, worlds // width) if fits else shares
         self.observer = observer if observer.fit is None else observer.fit(self.model)
         """Observer in the kernels; `HOST` if estimates are written from outside, see `PlugIns`."""
         self.model.coordinates = COORDINATES.index(self.observer.coordinates)
@@ -145,6 +157,8 @@ class World:
         sensors = scenario.sensors if self.source.knows_truth else ()  # other sources give their readings
         self.sensors = SensorStage(sensors, self.model, self.state, self.mask, self.precision, scenario.target_names)
         """Stage of the sensors beside the camera."""
+        self.in_lanes = fits and self._fused
+        """True if kernels take several worlds at once (`coopenv.lanes`)."""
         self._views: dict[str, np.ndarray] = {}
 
     def _build_model(self) -> Any:
@@ -209,10 +223,16 @@ class World:
         self.mask.zero_()
 
     @property
+    def _fused(self) -> bool:
+        """Whether one kernel runs whole decisions."""
+        return self.observer.fused and self.source.fused and self.launch.lanes == 1 and not self.sensors.there
+
+    @property
     def _world_kernels(self) -> Kernels:
         """Kernels of the source with the observer, or without it."""
-        if self.observer.fused and self.source.fused and self.launch.lanes == 1 and not self.sensors.there:
-            return fused_kernels(self.source, self.observer, self.precision)
+        if self._fused:
+            lanes = ("cell" if self.model.cells.across == 1 else "grid") if self.in_lanes else None
+            return fused_kernels(self.source, self.observer, self.precision, lanes)
         return source_kernels(self.source, self.precision)
 
     def restart(self) -> None:

@@ -109,7 +109,8 @@ def played(world: World, ticks: int = 300) -> State:
 
 
 @pytest.mark.parametrize(("name", "dtype"), BOTH)
-def test_a_world_does_not_know_its_batch(name: str, dtype: str) -> None:
+def test_a_world_does_not_know_its_batch(name: str, dtype: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COOPENV_LANES", "0")
     alone = played(start(MADE[name], [123 + 17], dtype), 150)
     many = played(start(MADE[name], range(123, 123 + 64), dtype), 150)
     assert_same(alone, many, slice(0, 1), slice(17, 18))

@@ -397,11 +397,11 @@ def nearest_in_grid(model: Any, state: Any, world: int, vehicle: int, p: Any, la
         for row in range(-ring, ring + 1):
             for column in range(-ring, ring + 1, wp.where(wp.abs(row) == ring, 1, 2 * ring)):
                 cell = cell_at(model, cell_of(model, p[0]) + column, cell_of(model, p[1]) + row)
-                item = first_in(state, world, cell, -1)
+                item = first_in(model, state, world, cell)
                 while item >= 0:
                     if item < model.landmarks:
                         best = follower_of(model, state, world, vehicle, p, last, best, item)
-                    item = next_in(state, world, item, -1)
+                    item = next_in(model, state, world, item, -1)
         if best.index >= 0 and type(edge)(best.distance) < type(edge)(ring) * edge - slack:
             return best
     best.index = -1
