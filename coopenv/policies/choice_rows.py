@@ -1,6 +1,6 @@
 """Batches whose actions are letters of the alphabet of `Choices`, for learning with any library of discrete actions."""
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
@@ -16,9 +16,10 @@ from coopenv.policies.choices import Choices
 class ChoiceRows(VectorWrapper):
     """Rows (world, vehicle) that choose a letter for half a second; a driver steers in between.
 
-    A step is as many decisions as a letter is kept for. Its reward is their sum; `terminated` and `truncated` are those
-    of any of them. A world that is over stands until the end of the step and is then reset, as in Gymnasium's mode
-    SAME_STEP: `infos["final_obs"]` and `infos["final_info"]` hold what the step has led to.
+    A step is as many decisions as a letter is kept for. Reward and `infos["reward_terms"]` are their sums; `terminated`,
+    `truncated` and `infos["alive"]` are those of any of them. A world that is over stands until the end of the step and
+    is then reset, as in Gymnasium's mode SAME_STEP: `infos["final_obs"]` and `infos["final_info"]` hold what the step
+    has led to, for a vehicle that has ended the observation at its end.
     """
 
     def __init__(self, env: CooperativeVectorEnv, driver: Choices | None = None) -> None:
@@ -32,8 +33,10 @@ class ChoiceRows(VectorWrapper):
             CoopenvError: the batch has another mode, or tensors.
         """
         super().__init__(env)
-        if env.autoreset_mode != AutoresetMode.DISABLED or env.arrays != "numpy":
+        if getattr(env, "autoreset_mode", None) != AutoresetMode.DISABLED or env.arrays != "numpy":
             raise CoopenvError("ChoiceRows resets worlds itself: make_vec(autoreset='disabled', arrays='numpy')")
+        if not isinstance(env.single_observation_space, spaces.Box):
+            raise CoopenvError("ChoiceRows reads flat observations: make_vec(observation='flat')")
         self.driver = driver or Choices(env.scenario)
         """The driver between two choices, with the alphabet."""
         self.single_action_space: Any = spaces.Discrete(len(self.driver.alphabet))
@@ -51,31 +54,32 @@ class ChoiceRows(VectorWrapper):
         """Follow the letters, (num_envs,) whole numbers of the alphabet, for `driver.kept` decisions.
 
         Raises:
+            CoopenvError: no `reset` came before.
             ActionError: the letters have another shape, or one is none of the alphabet.
         """
-        letters, most = np.asarray(actions), len(self.driver.alphabet)
-        if letters.shape != (self.num_envs,) or letters.dtype.kind not in "iu" or not self._are_letters(letters):
-            raise ActionError(f"expected ({self.num_envs},) whole numbers from 0 to {most - 1}, one letter per row")
+        if not self._observation.size:
+            raise CoopenvError("ChoiceRows.step: call reset() first")
+        letters, most = np.asarray(actions), len(self.driver.alphabet) - 1
+        whole = letters.shape == (self.num_envs,) and letters.dtype.kind in "iu"
+        if not whole or ((letters < 0) | (letters > most)).any():
+            raise ActionError(f"expected ({self.num_envs},) whole numbers from 0 to {most}, one letter per row")
         self.driver.take(letters)
-        rewards = np.zeros(self.num_envs)
-        terminated, truncated = (np.zeros(self.num_envs, dtype=bool) for _ in range(2))
+        rewards, terms, last = np.zeros(self.num_envs), dict[str, Any](), self._observation
+        acted, terminated, truncated = (np.zeros(self.num_envs, dtype=bool) for _ in range(3))
         for _ in range(self.driver.kept):
             driven = decide(self.driver, self._observation, self.env.single_action_space.shape[0])  # type: ignore[index]
             self._observation, reward, ends, cut, infos = self.env.step(driven.astype(np.float32))
+            last = np.where((terminated | truncated)[:, None], last, self._observation)
             rewards += reward
+            terms = {n: terms.get(n, 0.0) + infos["alive"] * part for n, part in infos["reward_terms"].items()}
+            acted |= infos["alive"]
             terminated |= ends
             truncated |= cut & ~terminated
-        if (over := self._over()).any():
-            final = {"final_obs": self._observation, "final_info": infos, "_final_obs": over, "_final_info": over}
+        infos = {**infos, "alive": acted, "reward_terms": terms}
+        ended, batch = terminated | truncated, cast(CooperativeVectorEnv, self.env.unwrapped)
+        over = np.repeat(batch.engine.view("over") != 0, batch.vehicles)
+        final = {"final_obs": last, "final_info": infos, "_final_obs": ended, "_final_info": ended}
+        if over.any():
             self._observation, infos = self.env.reset(options={"reset_mask": over})
             restart(self.driver, over)
-            infos = {**infos, **final}
-        return self._observation, rewards, terminated, truncated, infos
-
-    def _are_letters(self, letters: np.ndarray) -> bool:
-        return bool(((letters >= 0) & (letters < len(self.driver.alphabet))).all())
-
-    def _over(self) -> np.ndarray:
-        """Return flags (num_envs,) of the rows whose world is over."""
-        batch: Any = self.env.unwrapped
-        return np.repeat(batch.engine.view("over") != 0, batch.vehicles)
+        return self._observation, rewards, terminated, truncated, {**infos, **(final if ended.any() else {})}

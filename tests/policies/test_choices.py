@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import coopenv
+from coopenv.api.vector_env import RecordVehicleEpisodes
 from coopenv.base.errors import ActionError, CoopenvError
 from coopenv.policies import load_agent
 from coopenv.policies.choice_rows import ChoiceRows
@@ -117,10 +118,35 @@ def observation_size(scenario: coopenv.Scenario) -> int:
     return Choices(scenario).layout.size
 
 
+def test_episodes_that_end_within_a_step_are_counted_as_by_single_decisions() -> None:
+    """The horizon is no multiple of the time of a choice."""
+    options = {"num_worlds": 2, "autoreset": "disabled", "overrides": {"horizon": 10.2}}
+    plain, batched = (coopenv.make_vec("lighthouse", **options) for _ in range(2))
+    single, rows = RecordVehicleEpisodes(plain), RecordVehicleEpisodes(ChoiceRows(batched))  # type: ignore[arg-type]
+    driver, (observations, _) = Choices(plain.scenario), single.reset(seed=4)
+    rows.reset(seed=4)
+    expected, found = [], []
+    for _ in range(102):
+        observations, _, _, _, infos = single.step(driver(observations))
+        expected += [infos["episode"]] if "episode" in infos else []
+    for _ in range(21):
+        _, _, terminated, truncated, infos = rows.step(np.zeros(rows.num_envs, dtype=int))
+        np.testing.assert_array_equal(infos.get("_final_obs", np.zeros(rows.num_envs)), terminated | truncated)
+        found += [infos["episode"]] if "episode" in infos else []
+    (mine,), (other,) = found, expected
+    np.testing.assert_allclose(mine["r"], other["r"], rtol=1e-6)
+    for name, sums in mine["reward_terms"].items():
+        np.testing.assert_allclose(sums, other["reward_terms"][name], rtol=1e-6, atol=1e-6, err_msg=name)
+
+
 def test_mistakes_are_one_line() -> None:
     with pytest.raises(CoopenvError, match=r"ChoiceRows resets worlds itself: make_vec\(autoreset='disabled'"):
         ChoiceRows(coopenv.make_vec("lighthouse", num_worlds=1))
+    with pytest.raises(CoopenvError, match="flat observations"):
+        ChoiceRows(coopenv.make_vec("lighthouse", num_worlds=1, autoreset="disabled", observation="dict"))
     rows = ChoiceRows(batch())
+    with pytest.raises(CoopenvError, match="call reset"):
+        rows.step(np.zeros(6, dtype=int))
     rows.reset(seed=0)
     for letters in (np.zeros(6), np.full(6, rows.single_action_space.n), np.zeros(5, dtype=int)):
         with pytest.raises(ActionError, match=r"^expected \(6,\) whole numbers from 0 to \d+, one letter per row$"):
