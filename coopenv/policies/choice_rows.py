@@ -16,10 +16,10 @@ from coopenv.policies.choices import Choices
 class ChoiceRows(VectorWrapper):
     """Rows (world, vehicle) that choose a letter for half a second; a driver steers in between.
 
-    A step is as many decisions as a letter is kept for. Reward and `infos["reward_terms"]` are their sums; `terminated`,
-    `truncated` and `infos["alive"]` are those of any of them. A world that is over stands until the end of the step and
-    is then reset, as in Gymnasium's mode SAME_STEP: `infos["final_obs"]` and `infos["final_info"]` hold what the step
-    has led to, for a vehicle that has ended the observation at its end.
+    A step is as many decisions as a letter is kept for. Reward and `infos["reward_terms"]` are their sums; flags, with
+    `infos["alive"]`, are those of any of them. A world that is over stands until the end of the step and is then reset,
+    as in Gymnasium's mode SAME_STEP: `infos["final_obs"]` and `infos["final_info"]` hold what the step has led to, for
+    a vehicle that has ended the observation at its end.
     """
 
     def __init__(self, env: CooperativeVectorEnv, driver: Choices | None = None) -> None:

@@ -141,18 +141,21 @@ def doctor(
     from coopenv.report.table import Table
     from coopenv.sources.selection import Selection
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)  # the findings follow
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always", DataWarning)
         bag = open_bags(bags, options.parse_overrides(overrides), topics, Selection(trust=tuple(trust or ())))
     findings, console = bag.log.findings, options.console()
+    known = [*bag.notes, *map(str, findings)]  # warnings too; the others are of files that were read in part
+    lines = dict.fromkeys(str(each.message) for each in given)
+    notes = [*(line for line in lines if not any(line.endswith(text) for text in known)), *bag.notes]
     if as_json:
-        options.print_json({"findings": [*findings], "notes": [*bag.notes]})
+        options.print_json({"findings": [*findings], "notes": notes})
     else:
         table = Table.of_texts(["stream", "contradiction", "mended by", "treatment"], [])
         for finding in findings:
             table.add(finding.subject, finding.text, finding.key, finding.treatment.value)
         console.print(table if findings else "No stream contradicts another.", soft_wrap=not findings)
-        for note in bag.notes:
+        for note in notes:
             console.print(note, soft_wrap=True)
         read = [row for row in bag.log.rows if row.role]
         console.print(f"{bag.where}: {len(bag.binding.cars)} cars, {len(read)} topics", soft_wrap=True)

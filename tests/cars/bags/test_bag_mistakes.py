@@ -147,7 +147,7 @@ def test_a_truncated_bag_is_read_up_to_the_break(form: str, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("form", ["sqlite3", "mcap"])
-def test_a_folder_after_a_loss_of_power(form: str, topics: Path) -> None:
+def test_a_folder_after_a_loss_of_power(form: str, topics: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Its recorder has written neither metadata nor the end of the file."""
     folder = bags.write(topics.with_name("drive"), longer(), form)
     file = next(folder.glob("drive*.*"))
@@ -157,6 +157,8 @@ def test_a_folder_after_a_loss_of_power(form: str, topics: Path) -> None:
         bag, warned = bag_or_line(folder, topics)
         assert bag is not None and len(bag.log.samples) > len(longer()) / 3
         assert len([line for line in warned if "damaged after 2." in line]) == 1
+    main(["doctor", str(folder), "--map", str(topics)])
+    assert capsys.readouterr().out.count("damaged after 2.") == 1
 
 
 @pytest.mark.parametrize(("form", "tool"), [("sqlite3", "sqlite3 FILE .recover"), ("mcap", "mcap recover")])
