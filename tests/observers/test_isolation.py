@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,15 +25,16 @@ import numpy as np
 from coopenv.observers import Estimate, Message
 
 def is_secret(value):
-    if isinstance(value, np.ndarray) and value.dtype == float:
+    if issubclass(type(value), np.ndarray) and value.dtype == float:
         return bool((np.abs(value - 31415926.0) < 9.0).any())
     return type(value) is int and value - 1 == 987654320
 
 def parts(thing):
     yield thing
-    yield from thing.values() if isinstance(thing, dict) else thing if isinstance(thing, (list, tuple)) else ()
+    kind = type(thing)  # isinstance would ask a weak reference for the class of what it has lost
+    yield from list(thing.values()) if issubclass(kind, dict) else thing if issubclass(kind, (list, tuple)) else ()
     try:
-        yield from vars(thing).values()
+        yield from list(vars(thing).values())
     except Exception:  # has no attributes, or is a placeholder of Pydantic's
         pass
 
@@ -93,7 +95,10 @@ def test_an_observer_that_looks_everywhere_finds_neither_truth_nor_seed(tmp_path
     reference = f"{tmp_path / 'spy.py'}:Spy"
     result = apart(reference, recording)
     assert result.failure == "" and not result.position[1:].any()
-    assert run(load_reference(reference), recording).position[-1, 0, 0] > 0.0
+    lost = weakref.proxy(set())  # which other tests leave, too
+    result = run(load_reference(reference), recording)
+    del lost
+    assert result.failure == "" and result.position[-1, 0, 0] > 0.0
 
 
 OWN = '''
