@@ -315,7 +315,8 @@ def smallest_eigenvalue6(M: Any):
     """Return the smallest eigenvalue of a positive semidefinite 6x6 matrix.
 
     Laguerre's iteration from 0 on the characteristic polynomial of the tridiagonal form: monotone, since all roots
-    are real and lie to the right, and cubic near a simple root.
+    are real and lie to the right, and cubic near a simple root. The polynomials of the leading blocks are a Sturm
+    sequence: as long as all are positive, no root lies to the left, also if rounding has made some below 0.
     """
     scale = wp.trace(M)
     zero = M.dtype(0.0)
@@ -332,6 +333,7 @@ def smallest_eigenvalue6(M: Any):
         q = -one
         r0 = zero
         r = zero
+        least = p
         for i in range(1, 6):
             factor = d[i] - x
             new_p = factor * p - e[i - 1] * p0
@@ -343,7 +345,8 @@ def smallest_eigenvalue6(M: Any):
             p = new_p
             q = new_q
             r = new_r
-        if p <= zero:  # past the root by rounding: it has been found
+            least = wp.min(least, p)
+        if least <= zero:  # past the root by rounding: it has been found
             return wp.max(x, zero) * scale
         G = q / p
         H = G * G - r / p

@@ -39,8 +39,8 @@ class Choice(NamedTuple):
 class Choices(RouteFollower):
     """The route follower under choices; without a choice of its own every vehicle follows its route at top speed.
 
-    A served vehicle measures its helper: the helper drives 2 m in front of it, 1 m aside. Where no message of the
-    served vehicle is at hand, the helper follows its route.
+    A served vehicle measures its helper: the helper drives `AHEAD` m in front of it, `ASIDE` m aside. Where no message
+    of the served vehicle is at hand, the helper follows its route.
     """
 
     needs: tuple[str, ...] = ("message_position", "message_forward", "message_mask", "route_heading")
@@ -60,9 +60,8 @@ class Choices(RouteFollower):
         self._offset = np.array([choice.offset for choice in self.alphabet])
         self._pace = np.array([choice.pace for choice in self.alphabet])
         top = np.array([limits.max_speed for limits in scenario.limits])
-        own = np.arange(len(top))
-        others = np.array([np.delete(own, vehicle) for vehicle in own])
-        self._their_speed = top[others] if self.senders_known else np.full((len(top), senders), top.max())
+        others = np.array([np.delete(top, vehicle) for vehicle in range(len(top))])
+        self._their_speed = others if self.senders_known else np.full((len(top), senders), top.max())
 
     def choose(self, observations: np.ndarray, present: np.ndarray) -> np.ndarray:
         """Return the next letters, (rows,), from observations and the present letters: here those of the route."""

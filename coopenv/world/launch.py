@@ -234,18 +234,13 @@ def threads_and_lanes(worlds: int, vehicles: int, device: str, threads: int | No
     return max(min(by_world, most), 1), 1
 
 
-def computes_lanes(device: str, precision_name: str) -> bool:
-    """Return whether kernels of a device and precision can take several worlds at once (`coopenv.lanes`)."""
-    if device != "cpu" or precision_name != "float32" or lanes_guest() is None:
-        return False
-    start_warp()
-    return cpu_features() >= X86_64_V3
-
-
 def width_of_lanes(device: str, precision_name: str) -> int:
-    """Return how many worlds kernels take at once, if COOPENV_LANES is 1; 0: they take them one by one."""
-    wanted = os.environ.get("COOPENV_LANES", "") == "1" and computes_lanes(device, precision_name)
-    return int(lanes_guest().WIDTH) if wanted else 0
+    """Return how many worlds kernels of a device and precision can take at once (`coopenv.lanes`); 0: one by one."""
+    guest = lanes_guest() if (device, precision_name) == ("cpu", "float32") else None
+    if guest is None:
+        return 0
+    start_warp()
+    return int(guest.WIDTH) if cpu_features() >= X86_64_V3 else 0
 
 
 @dataclass(frozen=True)

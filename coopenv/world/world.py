@@ -1,5 +1,6 @@
 """A batch of worlds on a device: allocate, reset by mask, advance, save and restore."""
 
+import os
 import warnings
 from collections.abc import Hashable, Mapping, Sequence
 from itertools import pairwise
@@ -120,7 +121,7 @@ class World:
         N = self.model.vehicles
         shares, lanes = threads_and_lanes(worlds, N, self.device, threads)
         self.threads = max(shares, lanes) if self.device == "cpu" else 1
-        width = width_of_lanes(self.device, dtype)
+        width = width_of_lanes(self.device, dtype) if os.environ.get("COOPENV_LANES") == "1" else 0
         fits = 0 < width <= worlds and self.model.kept == 0
         shares = min(shares, worlds // width) if fits else shares
         self.observer = observer if observer.fit is None else observer.fit(self.model)

@@ -141,6 +141,15 @@ def test_smallest_eigenvalue_of_sums_of_squares(seed: int, decades: float) -> No
     assert (np.abs(call(linalg.smallest_eigenvalue6, "float64", M) - expected) <= bound).all()
 
 
+def test_smallest_eigenvalue_of_matrices_that_rounding_has_made_indefinite() -> None:
+    """Of rank two, with some eigenvalues a little below 0: an even number of them leaves the determinant positive."""
+    rng = np.random.default_rng(5)
+    C, noise = rng.normal(size=(4000, 2, 6)), 2e-7 * rng.normal(size=(4000, 6, 6))
+    M = np.swapaxes(C, 1, 2) @ C
+    M += (noise + np.swapaxes(noise, 1, 2)) * np.trace(M, axis1=1, axis2=2)[:, None, None]
+    assert (np.abs(call(linalg.smallest_eigenvalue6, "float64", M)) <= 1e-6 * np.trace(M, axis1=1, axis2=2)).all()
+
+
 DEFINITE = [name for name in SPECTRA if SPECTRA[name].min() > 0.0]
 
 

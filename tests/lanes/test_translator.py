@@ -13,14 +13,14 @@ import warp as wp
 
 from coopenv.lanes import translator
 from coopenv.lanes.translator import in_lanes, lanes_option
-from coopenv.world.launch import computes_lanes, launch, module_kernels
+from coopenv.world.launch import launch, module_kernels, width_of_lanes
 from coopenv.world.model import precision
 
 WORLDS = 21
 """Two steps of eight worlds, and five worlds that remain."""
 FLOATS, NUMBERS, VECTORS = 24, 16, 4
 """Results of a world."""
-pytestmark = pytest.mark.skipif(not computes_lanes("cpu", "float32"), reason="a processor without AVX2")
+pytestmark = pytest.mark.skipif(not width_of_lanes("cpu", "float32"), reason="a processor without AVX2")
 
 
 def ours(function: Callable[..., Any]) -> Callable[..., Any]:

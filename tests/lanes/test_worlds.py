@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.world.launch import computes_lanes
+from coopenv.world.launch import width_of_lanes
 from coopenv.world.world import World
 from tests.helpers.builders import State, assert_same, reset, simulate
 from tests.world.test_reproducibility import DRAWN, MADE, WALKING, noisy, played
@@ -21,7 +21,7 @@ SCENES = {
     "traffic with occluders": load_scenario("urban_crossing", {"observer.name": "riccati"}),
     "sensed topology": load_scenario("busy_intersection", {"topology.mode": "sensed"}),
 }
-pytestmark = pytest.mark.skipif(not computes_lanes("cpu", "float32"), reason="a processor without AVX2")
+pytestmark = pytest.mark.skipif(not width_of_lanes("cpu", "float32"), reason="a processor without AVX2")
 
 
 def pair(description: Scenario, worlds: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:

@@ -130,12 +130,12 @@ def lost_time(model: Any, state: Any, results: Any, world: int, vehicle: int) ->
         return 0.0
     decision = wp.float32(model.ticks_per_decision) / wp.float32(model.camera_rate)
     made = wp.ceil(wp.float32(state.tick[world]) / wp.float32(model.ticks_per_decision))
-    all_of_them = wp.ceil(wp.float32(model.horizon_ticks) / wp.float32(model.ticks_per_decision))
-    rest = all_of_them - made
+    decisions = wp.ceil(wp.float32(model.horizon_ticks) / wp.float32(model.ticks_per_decision))
+    rest = decisions - made
     if to_goal:
         length = wp.max(wp.float32(route_length(state, world, vehicle)), 1.0e-6)
         left = wp.clamp(wp.float32(goal_distance(model, state, world, vehicle)) / length, 0.0, 1.0)
-        rest = wp.min(made * left / wp.max(1.0 - left, 1.0e-6), all_of_them)
+        rest = wp.min(made * left / wp.max(1.0 - left, 1.0e-6), decisions)
     early = wp.max(wp.ceil(SETTLED_FROM / decision - 1.0e-4) - 1.0 - made, 0.0)
     return decision * wp.max(wp.max(wp.round(rest), 1.0) - early, 0.0)
 
