@@ -1,11 +1,16 @@
 """Checks of when messages come: outages, messages that come twice, delays, and clocks that no crystal drives."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from coopenv.cars.bags.clocks import CAMERAS, Times
+from coopenv.cars.bags.clocks import CAMERAS, NO_CRYSTAL, Times
+from coopenv.cars.bags.topic_map import COMMANDS, UNNEEDED
+from coopenv.cars.bags.tracks import Track
+from coopenv.cars.doctor.doctor import Examined, treated
 from coopenv.cars.doctor.finding import Finding, Treatment
+from coopenv.cars.doctor.motion import IN_THE_ROOM
+from coopenv.cars.doctor.streams import MOVING
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist
 from coopenv.cars.settings.profile import Role
 
@@ -18,18 +23,16 @@ REPEATED = 0.2
 """Share of equal values in a row above which a stream repeats itself, of values with noise."""
 LATE = 0.25
 """s by which a twentieth of the messages come later than the earliest: a network buffers them."""
-NO_CRYSTAL = 500e-6
-"""s per s, drift above which a clock is none with a quartz crystal, whose errors are below 100e-6 from -40 to 85 C."""
 
 
-def of_outages(samples: Sequence[Sample], topic: str, end: int) -> Iterator[Finding]:
-    """Yield the longest silence of a topic of a drive that ends at a time, ns.
+def of_outages(samples: Sequence[Sample], topic: str, begin: int, end: int) -> Iterator[Finding]:
+    """Yield the longest silence of a topic of a drive that begins and ends at times, ns.
 
     Cameras that send nothing without a marker in view are often silent, and by right.
     """
     if len(samples) < 2 * FEW:
         return
-    stamps = np.array([*(sample.stamp for sample in samples), end])
+    stamps = np.array([begin, *(sample.stamp for sample in samples), end])
     gaps = np.diff(stamps) * NS
     if samples[0].role in CAMERAS and (gaps > OFTEN * np.median(gaps)).sum() > FEW and all(map(_markers, samples)):
         return
@@ -45,13 +48,20 @@ def _markers(sample: Sample) -> bool:
     return isinstance(sample.value, Detections) and bool(sample.value.markers)
 
 
-def of_duplicates(stamps: Times, topic: str, car: str) -> Iterator[Finding]:
-    """Yield that messages have the stamp (n,), ns, of another one, 0: none."""
-    given = stamps[stamps != 0]
-    twice = len(given) - len(np.unique(given))
-    if twice > max(FEW, SHARE * len(given)):
-        text = f"{twice} of {len(given)} messages are duplicates: they have the stamp of another one"
-        yield Finding(topic, text, twice, treatment=Treatment.LEFT_OUT, car=car)
+def of_duplicates(samples: Sequence[Sample], topic: str) -> Iterator[Finding]:
+    """Yield that messages have the stamp of an earlier one; a stamp of 0 is none."""
+    first: dict[int, list[float]] = {}
+    twice = other = 0
+    for sample in (sample for sample in samples if sample.stamp):
+        twice += sample.stamp in first
+        other += first.setdefault(sample.stamp, numbers := _numbers(sample)) != numbers
+    given = len(first) + twice
+    if twice > max(FEW, SHARE * given):
+        text, key = f"{twice} of {given} messages are duplicates: they have the stamp of another one", ""
+        if other > 0.5 * twice:
+            text = f"{twice} of {given} messages have other values than the first of the same stamp: stamps are coarse"
+            key = 'clocks.mode = "received"'
+        yield Finding(topic, text, twice, None, key, Treatment.LEFT_OUT, samples[0].car)
 
 
 def of_repeats(samples: Sequence[Sample], topic: str) -> Iterator[Finding]:
@@ -63,8 +73,7 @@ def of_repeats(samples: Sequence[Sample], topic: str) -> Iterator[Finding]:
     alone = same & ~np.append(same[1:], False) & ~np.append(False, same[:-1])  # not of a stream that sticks
     if alone.mean() > REPEATED:
         text = f"{int(alone.sum())} of {len(samples)} messages are duplicates: they repeat the value of the one before"
-        treatment = Treatment.LEFT_OUT if samples[0].role is Role.TRUTH else Treatment.USED
-        yield Finding(topic, text, int(alone.sum()), treatment=treatment, car=samples[0].car)
+        yield Finding(topic, text, int(alone.sum()), car=samples[0].car)
 
 
 def _numbers(sample: Sample) -> list[float]:
@@ -107,3 +116,53 @@ def of_frames(samples: Sequence[Sample], topic: str, frames: Collection[str], in
         where, other = ("pose's", "body's") if in_the_room else ("body's", "pose's")
         text = f"its twist is in the {where} frame, while child_frame_id = {child!r} states the {other}"
         yield Finding(topic, text, car=samples[0].car)
+
+
+def of_timing(
+    tracks: Sequence[Track],
+    samples: Sequence[Sample],
+    drifts: Mapping[str, float],
+    examined: Examined,
+    trusted: Collection[str],
+) -> Iterator[Finding]:
+    """Yield what is wrong with the times of messages, and with the frames that these state.
+
+    Args:
+        tracks: of the topics, without drifts.
+        samples: of all topics, on one clock.
+        drifts: of topics, which were removed.
+        examined: the gate's findings of the topics' values.
+        trusted: subjects of findings that stay unchanged; of two messages with one stamp only one can be used.
+    """
+    for track in tracks:
+        yield from of_duplicates(track.entries, track.chosen.topic)
+    for finding in _of_topics(tracks, samples, drifts, examined):
+        yield treated(finding, trusted)
+
+
+def _of_topics(
+    tracks: Sequence[Track], samples: Sequence[Sample], drifts: Mapping[str, float], examined: Examined
+) -> Iterator[Finding]:
+    """Yield what is wrong with times and frames, but for duplicates."""
+    in_the_room = {finding.subject for finding in examined.findings if IN_THE_ROOM in finding.text}
+    truth = {s.stated.frame for s in samples if s.role is Role.TRUTH}
+    needed = [s.stamp for s in samples if s.role not in UNNEEDED] or [0]
+    by_topic = {
+        entry: [s for s in samples if (s.car, s.role) == (entry.car, entry.sample_role)]
+        for entry in dict.fromkeys(track.chosen for track in tracks)
+    }
+    for track in tracks:
+        car, topic = track.chosen.car, track.chosen.topic
+        stamps, received = (np.array([getattr(e, name) for e in track.entries]) for name in ("stamp", "received"))
+        yield from of_delays(stamps, received, topic, car)
+        if topic in drifts:
+            yield from of_drift(drifts[topic], topic, car)
+    left_out = {finding.subject for finding in examined.findings if finding.treatment is Treatment.LEFT_OUT}
+    for entry, own in by_topic.items():
+        if entry.role in COMMANDS or entry.topic in left_out:
+            continue
+        yield from of_outages(own, entry.topic, min(needed), max(needed))
+        yield from of_repeats(own, entry.topic)
+        streams = examined.cars.get(entry.car)
+        if entry.role in MOVING and streams is not None and (streams.truth_signals or streams.own_signals):
+            yield from of_frames(own, entry.topic, truth, entry.topic in in_the_room)

@@ -20,8 +20,8 @@ from coopenv.bench.observers import sources
 from coopenv.cars.backend.recorded_drive import DriveRecorder
 from coopenv.cars.backend.sources import BAG, DRIVE
 from coopenv.cars.bags.bag import Bag
-from coopenv.cars.bags.log import Shift, reconcile, recorders
 from coopenv.cars.bags.topics import regularity
+from coopenv.cars.bags.tracks import Shift, reconcile, recorders
 from coopenv.cars.messages import codec
 from coopenv.cli.app import main
 from coopenv.observers import Recording, run

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -33,24 +35,36 @@ def silent(*gaps: tuple[float, float]) -> np.ndarray:
 
 
 def test_an_outage_is_stated_and_short_ones_are_ordinary() -> None:
-    [found] = of_outages(samples(silent((5.0, 8.0), (12.0, 14.0))), "/imu", 20 * S)
+    [found] = of_outages(samples(silent((5.0, 8.0), (12.0, 14.0))), "/imu", 0, 20 * S)
     assert found.treatment is Treatment.USED and "an outage of 3.0 s after 5.0 s, the longest of 2" in str(found)
-    assert not [*of_outages(samples(silent((5.0, 6.0), (9.0, 9.5))), "/imu", 20 * S)]
-    [ended] = of_outages(samples(EVERY[EVERY < 12.0]), "/imu", 20 * S)
+    assert not [*of_outages(samples(silent((5.0, 6.0), (9.0, 9.5))), "/imu", 0, 20 * S)]
+    [ended] = of_outages(samples(EVERY[EVERY < 12.0]), "/imu", 0, 20 * S)
     assert ended.size == pytest.approx(8.0, abs=0.05)
 
 
 def test_a_camera_that_is_silent_without_a_marker_has_no_outage() -> None:
     often = silent(*((begin, begin + 2.0) for begin in np.arange(1.0, 19.0, 3.0)))
-    assert not [*of_outages(samples(often, Role.DETECTIONS), "/camera", 20 * S)]
-    assert [*of_outages(samples(silent((5.0, 9.0)), Role.DETECTIONS), "/camera", 20 * S)]
+    assert not [*of_outages(samples(often, Role.DETECTIONS), "/camera", 0, 20 * S)]
+    assert [*of_outages(samples(silent((5.0, 9.0)), Role.DETECTIONS), "/camera", 0, 20 * S)]
 
 
 def test_messages_that_come_twice_are_left_out_by_their_stamp() -> None:
-    stamps = np.repeat(np.arange(1, 200) * 10_000_000, 2)
-    [found] = of_duplicates(stamps, "/imu", "car")
-    assert found.treatment is Treatment.LEFT_OUT and "199 of 398" in found.text
-    assert not [*of_duplicates(stamps[::2], "/imu", "car")] and not [*of_duplicates(0 * stamps, "/imu", "car")]
+    sent = samples(np.repeat(np.arange(1, 200) * 0.01, 2))
+    [found] = of_duplicates(sent, "/imu")
+    assert found.treatment is Treatment.LEFT_OUT and "199 of 398 messages are duplicates" in found.text
+    undated = [replace(sample, stamp=0) for sample in sent]
+    assert not [*of_duplicates(sent[::2], "/imu")] and not [*of_duplicates(undated, "/imu")]
+
+
+def test_other_values_with_the_same_stamp_are_no_duplicates() -> None:
+    coarse = [replace(sample, stamp=sample.stamp // 40_000_000 * 40_000_000) for sample in samples(EVERY + 1.0)]
+    [found] = of_duplicates(coarse, "/imu")
+    assert "stamps are coarse" in found.text and "duplicate" not in found.text
+
+
+def test_a_topic_that_begins_late_has_an_outage() -> None:
+    [found] = of_outages(samples(EVERY[EVERY > 15.0]), "/pose", 0, 20 * S)
+    assert found.size == pytest.approx(15.0, abs=0.05) and "after 0.0 s" in found.text
 
 
 def test_poses_that_repeat_under_new_stamps_are_duplicates() -> None:
