@@ -448,6 +448,7 @@ FAULTS: dict[str, tuple[Fault, str]] = {
     "image upside down": (pixels(lambda u, v: (315 - u, 207 - v)), "upside down|mounting"),
     "image mirrored": (pixels(lambda u, v: (315 - u, v)), "mirrored"),
     "markers exchanged": (numbered({1: 3, 3: 1}), "M1 and M3 are exchanged"),
+    "marker far off": (landmarks(lambda k, p: p + np.array([-0.9, 0.95, 0.0]) * (k == 2)), "landmark M3 stands"),
     "marker moved": (landmarks(lambda k, p: p + np.array([0.25, 0.0, 0.0]) * (k == 1)), "marker M2: position"),
     "map in cm": (landmarks(lambda k, p: 100.0 * p), "landmarks are in cm"),
     "map mirrored": (landmarks(lambda k, p: p * [-1, 1, 1]), "map is mirrored"),
@@ -466,6 +467,7 @@ FAULTS: dict[str, tuple[Fault, str]] = {
     "gyro in degrees, no truth": (no_truth(gyro([57.29578] * 3)), "turn rate .*deg/s"),
     "gyro is zero, no truth": (no_truth(gyro([0, 0, 0])), "turn rate .* is 0 rad/s"),
     "wheels reversed, no truth": (no_truth(wheels(-1.0)), "velocity .* other sign"),
+    "wheels in km/h, no truth": (no_truth(wheels(3.6)), "velocity .*km/h"),
     "twice the size, no truth": (no_truth(info(lambda m: _twice_the_size(m, 0))), "focal length"),
     "markers exchanged, no truth": (no_truth(numbered({1: 3, 3: 1})), "M1 and M3 are exchanged"),
     "camera yaw, no truth": (no_truth(camera(orientation=quaternion(3.0))), "orientation|mounting"),
@@ -599,7 +601,7 @@ def timed(function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-for _name in ("examine", "examine_constants", "_of_timing"):
+for _name in ("examine", "examine_constants", "of_timing"):
     setattr(log, _name, timed(getattr(log, _name)))
 
 

@@ -138,6 +138,7 @@ def _card(trainer: Trainer | SetTrainer, environment: EnvironmentFile, results: 
             "settings": settings_digest(plan),
             **({"arm": plan.arm} if plan.arm else {}),
             "steps": trainer.status.steps,
+            "discount": plan.settings.ppo.discount(trainer.scenario),  # per decision
             "minutes": round(trainer.status.seconds / 60.0, 2),
             "cpu_minutes": round(trainer.cpu_seconds / 60.0, 2),
             "versions": {"coopenv": version(), **versions(*PACKAGES)},

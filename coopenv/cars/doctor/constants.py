@@ -92,19 +92,21 @@ def _coarse(drive: CalibrationDrive, name: str, bad: float = BAD) -> Iterator[tu
         (car,), batch = drive.cars, Batch(replace(drive, places=drive.places.copy()), False)
         if (given := _windows(drive)) < bad:
             return
-        if pairs := exchanged(batch):
-            for i, j in pairs:
-                text = f"markers {drive.landmarks[i]} and {drive.landmarks[j]} are exchanged"
-                about = Finding("markers", text, treatment=Treatment.REFUSED, car=name)
-                drive = replace(drive, places=batch.places)
-                yield about, drive
-            continue
-        tried = [(replace(drive, cars=(car,), places=places), text) for text, car, places in _changes(drive, car)]
-        least, n = min((_windows(changed), n) for n, (changed, _) in enumerate(tried))
+        pairs, refused = exchanged(batch), Treatment.REFUSED
+        tried = [
+            ([Finding(name, text, treatment=refused, car=name)], replace(drive, cars=(car,), places=places))
+            for text, car, places in _changes(drive, car)
+        ]
+        texts = [f"markers {drive.landmarks[i]} and {drive.landmarks[j]} are exchanged" for i, j in pairs]
+        found = [Finding("markers", text, treatment=refused, car=name) for text in texts]
+        tried += [(found, replace(drive, places=batch.places))] if pairs else []
+        least, n = min((_windows(changed), n) for n, (_, changed) in enumerate(tried))
         if least > REMOVED * given:
-            return
-        drive, text = tried[n]
-        yield Finding(name, text, treatment=Treatment.REFUSED, car=name), drive
+            if not pairs:
+                return
+            n = len(tried) - 1  # with a criterion of its own
+        found, drive = tried[n]
+        yield from ((about, drive) for about in found)
 
 
 def _windows(drive: CalibrationDrive) -> float:

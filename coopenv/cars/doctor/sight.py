@@ -10,6 +10,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from coopenv.cars.bags.clocks import CAMERAS
@@ -28,8 +29,10 @@ BAD = 0.004
 OFF_DEG = 3.6
 REMOVED = 0.35
 """Share of the misfit that the cause leaves at most."""
-SMALL_DEG, SMALL_LOG = 6.0, math.log(1.2)
-"""Mountings (deg) and focal lengths (logarithm of the factor) from which a calibration finds the right ones."""
+SMALL_DEG, SMALL_LOG, SMALL_M = 6.0, math.log(1.2), 0.3
+"""Mountings (deg), focal lengths (logarithm of factors) and places (m) from which calibration finds the right ones."""
+OTHERS, MEETING = 3, 1e-3
+"""Landmarks beside one that may be elsewhere; least ratio of the axes of the ellipsoid in which its lines meet."""
 LATE = (-0.4, -0.2, -0.1, 0.1, 0.2, 0.4)
 """s, offsets of clocks that are tried beside other causes; the clocks themselves are looked at elsewhere."""
 
@@ -43,6 +46,7 @@ class PosedSightings:
     ray: Array  # (m, 3) unit vectors, body
     ahead: Array
     """(m, 3) from the camera to the markers in the body frame, m."""
+    target: NDArray[np.int64]
 
     def off_deg(self) -> Array:
         """Return the angles (m,) between rays and markers, deg."""
@@ -81,7 +85,7 @@ def sight_of(car: CarStreams) -> PosedSightings:
     place, yaw, point = (x + 1j * y)[there], yaw[there], point[there]
     flat = np.exp(-1j * yaw) * (point[:, 0] + 1j * point[:, 1] - place)
     ahead = np.stack([flat.real, flat.imag, point[:, 2] - car.height], axis=-1) - car.lever
-    return PosedSightings(place, yaw, car.ray[there] @ car.mounting.T, ahead)
+    return PosedSightings(place, yaw, car.ray[there] @ car.mounting.T, ahead, car.target[there])
 
 
 @dataclass(frozen=True)
@@ -164,6 +168,7 @@ def causes(car: CarStreams, every: bool = True) -> Iterator[Cause]:
     yield from _of_truth(car)
     if every:
         yield _of_frame(car)
+        yield from _of_places(car)
     yield from _of_camera(car)
     role = next((role for role in CAMERAS if role in car.topics), CAMERAS[0])
     for seconds in LATE:
@@ -196,6 +201,31 @@ def _of_frame(car: CarStreams) -> Cause:
     text = f"its frame is {degrees:.1f} deg and {abs(shift):.2f} m from that of the map"
     moved = of_truth(lambda p: np.exp(1j * angle) * p + shift, lambda yaw: yaw + angle)
     return Cause(topic, text, moved, degrees, None, key, 3, ("frame of motion capture",))
+
+
+def _of_places(car: CarStreams) -> Iterator[Cause]:
+    """Yield the places at which the lines of sight to a landmark meet, least squares, if there are others."""
+    sight = sight_of(car)
+    turn = Rotation.from_euler("z", sight.yaw[:, None])
+    camera = np.stack([sight.place.real, sight.place.imag, car.height + 0.0 * sight.yaw], axis=-1)
+    camera, unit = camera + turn.apply(car.lever), turn.apply(sight.ray)
+    counts = np.bincount(sight.target, minlength=len(car.places))
+    for k in np.flatnonzero(counts >= FEWEST).tolist() if (counts >= FEWEST).sum() > OTHERS else ():
+        rows = sight.target == k
+        across = np.eye(3) - unit[rows, :, None] * unit[rows, None, :]
+        if np.linalg.cond(across.sum(axis=0)) > 1.0 / MEETING:
+            continue
+        place = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, camera[rows]))
+        places, distance = car.places.copy(), float(np.linalg.norm(place - car.places[k]))
+        places[k] = place
+        text = f"landmark {car.names[k]} stands at {_listed(place, 2)} m, {distance:.2f} m from its place on the map"
+        small, parts = distance < SMALL_M, (f"marker {car.names[k]}: position",)
+        yield Cause("landmarks", text, of_places(places), distance, None, "", 3, parts, small)
+
+
+def of_places(places: Array) -> Change:
+    """Return the change to other places (L, 3) of the landmarks."""
+    return lambda car: replace(car, places=places)
 
 
 def _same(values: Any) -> Any:

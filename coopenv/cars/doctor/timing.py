@@ -9,7 +9,7 @@ from coopenv.cars.bags.topic_map import COMMANDS, UNNEEDED
 from coopenv.cars.bags.tracks import Track
 from coopenv.cars.doctor.doctor import Examined, treated
 from coopenv.cars.doctor.finding import Finding, Treatment
-from coopenv.cars.doctor.motion import IN_THE_ROOM
+from coopenv.cars.doctor.motion import IN_THE_ROOM, velocity_relations
 from coopenv.cars.doctor.streams import MOVING
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist
 from coopenv.cars.settings.profile import Role
@@ -163,6 +163,7 @@ def _of_topics(
             continue
         yield from of_outages(own, entry.topic, min(needed), max(needed))
         yield from of_repeats(own, entry.topic)
-        streams = examined.cars.get(entry.car)
-        if entry.role in MOVING and streams is not None and (streams.truth_signals or streams.own_signals):
+        streams = examined.cars.get(entry.car) if entry.role in MOVING else None
+        paths = None if streams is None else streams.truth_signals or streams.own_signals
+        if streams is not None and paths is not None and velocity_relations(streams, *paths)[0] is not None:
             yield from of_frames(own, entry.topic, truth, entry.topic in in_the_room)

@@ -204,7 +204,7 @@ def test_a_sound_drive_is_silent(truth: bool, seed: int) -> None:
     assert not [str(finding) for finding in findings_of(streams_of(None, truth, seed))]
 
 
-BLIND = ("gyro reversed", "gyro in degrees", "gyro is zero", "wheels reversed", "markers exchanged")
+BLIND = ("gyro reversed", "gyro in degrees", "gyro is zero", "wheels reversed", "wheels in km/h", "markers exchanged")
 
 
 @pytest.mark.parametrize("name", BLIND)
@@ -344,6 +344,16 @@ def test_a_map_without_standing_landmarks_is_compared_with_nothing() -> None:
 
 def test_an_error_that_is_not_known_has_no_brackets() -> None:
     assert with_error(1.5, np.inf) == "1.5"
+
+
+def test_a_landmark_that_stands_elsewhere_is_named_with_its_place() -> None:
+    streams = streams_of(None)
+    car = streams.car(next(iter(streams.binding.cars)))
+    k, places = int(np.bincount(car.target.copy()).argmax()), car.places.copy()
+    places[k, 0] += 1.5
+    (found,) = examine_cars([replace(car, places=places)]).findings
+    assert found.treatment is Treatment.REFUSED and found.size == pytest.approx(1.5, abs=0.05)
+    assert f"landmark {car.names[k]} stands at {car.places[k, 0]:.1f}" in found.text
 
 
 def test_exchanged_markers_are_mended_by_the_whole_table() -> None:
