@@ -448,7 +448,10 @@ FAULTS: dict[str, tuple[Fault, str]] = {
     "image upside down": (pixels(lambda u, v: (315 - u, 207 - v)), "upside down|mounting"),
     "image mirrored": (pixels(lambda u, v: (315 - u, v)), "mirrored"),
     "markers exchanged": (numbered({1: 3, 3: 1}), "M1 and M3 are exchanged"),
-    "marker far off": (landmarks(lambda k, p: p + np.array([-0.9, 0.95, 0.0]) * (k == 2)), "landmark M3 stands"),
+    "marker far off": (
+        landmarks(lambda k, p: p + np.array([-0.9, 0.95, 0.0]) * (k == 2)),
+        "landmark M3 stands|marker M3: position",
+    ),
     "marker moved": (landmarks(lambda k, p: p + np.array([0.25, 0.0, 0.0]) * (k == 1)), "marker M2: position"),
     "map in cm": (landmarks(lambda k, p: 100.0 * p), "landmarks are in cm"),
     "map mirrored": (landmarks(lambda k, p: p * [-1, 1, 1]), "map is mirrored"),
