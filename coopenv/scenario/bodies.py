@@ -299,7 +299,7 @@ class Vehicle(Section):
             raise ValueError("entry: the first time, then the last one, of driven vehicles and traffic")
         for name, does in (("initial_pose", "starts on its route"), ("goal", "goes to the end of its route")):
             part = getattr(self, name)
-            values = dict(part or ())
+            values = vars(part) if part else {}
             given = [key for key in ("position", "yaw", "quaternion_wxyz") if values.get(key) is not None]
             if self.routes and given:
                 raise ValueError(f"{name}.{given[0]}: a vehicle with routes {does}; leave this out")

@@ -28,7 +28,7 @@ def check_room(vehicles: Sequence[Vehicle], routes: Sequence[Route], obstacles: 
     kinds: list[int] = []  # vehicles that start in the same boxes have one number
     boxes, count = list[Boxes](), 0
     for i, v in enumerate(vehicles):
-        kinds.append(equal.setdefault((v.routes, v.initial_pose, v.body, dict(v.motion).get("waypoints")), len(equal)))
+        kinds.append(equal.setdefault((v.routes, v.initial_pose, v.body, vars(v.motion).get("waypoints")), len(equal)))
         if len(equal) > len(boxes):
             boxes.append(possible_boxes(v, known))
             count += len(boxes[-1].half)
