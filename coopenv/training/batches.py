@@ -95,6 +95,8 @@ class NormalisedEnv(VecEnvWrapper):
         """Running mean and variance of discounted returns, in the units of the scenario."""
         self.returns = np.zeros(venv.num_envs)
         self.looked_at: deque[np.ndarray] = deque(maxlen=SEEN)
+        self.settled = False
+        """Whether the statistics of observations stay as they are: a policy has been fitted to them."""
         self._present: np.ndarray | None = None
         self._rule, self._raw = rule, np.empty(0)
 
@@ -135,7 +137,8 @@ class NormalisedEnv(VecEnvWrapper):
             present, self._present = self._present, None
             return present
         self._raw = observations = self.venv.reset()
-        self.statistics.update(observations)
+        if not self.settled:
+            self.statistics.update(observations)
         return self.normalise(observations)
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -147,7 +150,8 @@ class NormalisedEnv(VecEnvWrapper):
         observations, rewards, dones, infos = self.venv.step_wait()
         self._raw = observations
         if self.venv.acted.any():
-            self.statistics.update(observations[self.venv.acted])
+            if not self.settled:
+                self.statistics.update(observations[self.venv.acted])
             self.looked_at.append(observations[self.venv.acted])
         for row in np.flatnonzero(dones):
             infos[row]["terminal_observation"] = self.normalise(infos[row]["terminal_observation"])

@@ -47,7 +47,7 @@ WHILE_LEARNING = 2**30
 
 
 KEPT_FOR = 60.0  # s of learning after which at the latest there is a checkpoint
-FORMAT = 3
+FORMAT = 4
 HEADER = "coopenv_checkpoint"
 Judge = Callable[[Policy, str, list[int]], list[Result]]
 """Returns the figures of a driver, with its name, in the worlds of some seeds."""
@@ -295,7 +295,7 @@ class Checkpoint(BaseModel):
     scenario: str
     """JSON of the scenario, to find out whether it is still the same."""
     progress: dict[str, int | float]
-    """`steps`, `seconds` and `cpu_seconds`."""
+    """`steps`, `seconds`, `cpu_seconds`, and whether the critic still learns alone."""
     course: Course
     onnx: bool = False
     """Write an ONNX model, too, as on the command line."""
@@ -313,6 +313,7 @@ def save(path: Path, trainer: Trainer, course: Course, onnx: bool = False, logs:
         OutputError: it cannot be written; the one before is whole.
     """
     spent = {"seconds": trainer.seconds, "cpu_seconds": trainer.cpu_seconds}
+    spent["critic_alone"] = trainer.model.critic_alone
     header = Checkpoint(
         plan=trainer.plan,
         scenario=trainer.scenario.model_dump_json(),
@@ -381,6 +382,7 @@ def restore(checkpoint: Checkpoint, trainer: Trainer) -> None:
         np.random.set_state({"bit_generator": "MT19937", "state": {"key": key, "pos": int(position[0])}})
         trainer.model.num_timesteps = int(checkpoint.progress["steps"])
         trainer.seconds, trainer.cpu_seconds = checkpoint.progress["seconds"], checkpoint.progress["cpu_seconds"]
+        trainer.model.critic_alone = bool(checkpoint.progress["critic_alone"])
         if "world" in arrays:
             trainer.env.go_on_from(trainer.batch.set_state(arrays["world"]))
         else:

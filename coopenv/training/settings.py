@@ -61,6 +61,9 @@ class Ppo(Section):
     """Lambda of the generalised advantage estimate (Schulman et al. 2016)."""
     clip: Positive = 0.2
     """Clipping range of the probability ratio."""
+    critic_first: Share | None = 0.8
+    """Share of the returns' variance that the critic explains before the policy of a clone, or of an agent that the
+    training continues, moves; after a quarter of the steps it moves in any case."""
     entropy: NonNegative = 0.0
     """Weight of the entropy bonus."""
     value_weight: NonNegative = 0.5
@@ -95,8 +98,11 @@ class Clone(Section):
     """Agent whose actions and returns are learnt by regression before training: name, folder or `file.py:Class`."""
     episodes: Count = 64
     """Recorded worlds, one episode each."""
+    rounds: Count = 1
+    """Rounds, each with its part of the worlds: after the first the clone drives, and the agent's actions are what it
+    should have done (Ross et al. 2011)."""
     epochs: Count = 20
-    """Passes over the recorded actions."""
+    """Passes over the recorded actions, in every round."""
     learning_rate: Positive = 1e-3
     """Learning rate of Adam."""
     noise: NonNegative = 0.1

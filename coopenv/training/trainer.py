@@ -104,6 +104,8 @@ class Watch(BaseCallback):
 COUNTS = f"{CRITIC}counts"
 """Tensor of an agent's weights: count of the observations; mean, variance and count of the returns."""
 BATCH = 512  # rows per gradient step
+LONGEST_ALONE = 0.25
+"""Share of the steps from which on the policy learns, too, whatever the critic explains."""
 
 
 def watch(
@@ -115,10 +117,12 @@ def watch(
     threads: int,
     report: Callable[[str], None],
     rule: RightOfWay | None = None,
+    clone: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return observations (rows, D), the driver's actions (rows, A), discounted returns and vehicles (rows,).
 
-    Where the rule alone would slow the vehicle down as much, the speed is the largest one.
+    With a clone, it drives, and the driver's actions are those that it would have taken. Where the rule alone would
+    slow the vehicle down as much, the speed is the largest one.
     """
     env = CooperativeVectorEnv(scenario, "clone", num_worlds=worlds, autoreset="disabled", threads=threads)
     driver, noise = load_agent(settings.agent, scenario), np.random.default_rng(seed)
@@ -129,7 +133,8 @@ def watch(
     while under_way.any():
         report(f"watching {settings.agent}: {len(steps) / scenario.rates.decision:.0f} of {scenario.horizon:g} s")
         action = decide(driver, observation, scenario.action_size)
-        tried = np.clip(action + settings.noise * noise.standard_normal(action.shape), -1.0, 1.0)
+        tried = action if clone is None else clone(observation)
+        tried = np.clip(tried + settings.noise * noise.standard_normal(action.shape), -1.0, 1.0)
         before, acted = observation, under_way
         observation, reward, terminated, truncated, _ = env.step(tried.astype(np.float32))
         if rule:
@@ -242,6 +247,8 @@ class Trainer:
             device="cpu",
         )
         self.model.set_logger(Logger(None, []))
+        self.env.settled = plan.settings.start is not None or plan.settings.clone is not None
+        self.model.critic_alone = self.env.settled and ppo.critic_first is not None
         self._watch = Watch(self.batch)
         self.notes: list[str] = []
         """Remarks for the end."""
@@ -255,6 +262,8 @@ class Trainer:
                 self.take(tensors)
             except (RuntimeError, KeyError, ValueError) as error:
                 raise CoopenvError(f"start: {start} has not the widths ppo.hidden = {[*widths]}: {error}") from None
+            if "initial_std" in self.plan.settings.ppo.model_fields_set:
+                nn.init.constant_(self.model.policy.log_std, math.log(self.plan.settings.ppo.initial_std))
             if COUNTS not in tensors:
                 self.notes.append(f"{start} was saved without a critic: a new one learnt from its episodes")
                 self._imitate(Clone(agent=start), report, critic_only=True)
@@ -266,26 +275,45 @@ class Trainer:
     def _imitate(self, clone: Clone, report: Callable[[str], None], critic_only: bool = False) -> None:
         """Fit the mean action to a driver's actions, and the value to the discounted rewards that follow.
 
-        Its observations are also the first in the statistics for normalisation. Noise is added to its actions, so that
-        its corrections of deviations are recorded (Laskey et al. 2017).
+        The observations of the first round are also the first in the statistics for normalisation. Noise is added to
+        all actions, so that corrections of deviations are recorded (Laskey et al. 2017).
         """
-        policy, seed = self.model.policy, self.plan.seed
-        all_worlds, threads = sum(count for _, count in self._scenarios), self.batch.engine.world.threads
-        watched = []
-        for place, (each, count) in enumerate(self._scenarios):
-            worlds, start = max(1, clone.episodes * count // all_worlds), seed + APART * place
-            rule = RightOfWay(each) if self.rule else None
-            watched.append(watch(each, worlds, clone, self.gamma, start, threads, report, rule))
-        raw, actions, returns, _ = (np.concatenate(column) for column in zip(*watched, strict=True))
-        if critic_only:
-            self.env.statistics.count = len(raw)
-        else:
-            self.env.statistics.update(raw)
+        watched: list[tuple[np.ndarray, ...]] = []
+        for part in range(clone.rounds):
+            watched += self._watched(clone, part, report)
+            raw, actions, returns, _ = (np.concatenate(column) for column in zip(*watched, strict=True))
+            if part == 0:
+                if critic_only:
+                    self.env.statistics.count = len(raw)
+                else:
+                    self.env.statistics.update(raw)
+                self.env.spread.update(returns)
+            self._fit(clone, raw, actions, returns, report, critic_only)
         self.env.looked_at.append(raw)
+
+    def _watched(self, clone: Clone, part: int, report: Callable[[str], None]) -> Iterator[tuple[np.ndarray, ...]]:
+        """Yield what `watch` returns in the worlds of a round, by scenario."""
+        all_worlds, threads = sum(count for _, count in self._scenarios), self.batch.engine.world.threads
+        for place, (each, count) in enumerate(self._scenarios, part * len(self._scenarios)):
+            worlds, start = max(1, clone.episodes * count // all_worlds // clone.rounds), self.plan.seed + APART * place
+            rule = RightOfWay(each) if self.rule else None
+            yield watch(
+                each, worlds, clone, self.gamma, start, threads, report, rule, self.mean_action if part else None
+            )
+
+    def _fit(
+        self,
+        clone: Clone,
+        raw: np.ndarray,
+        actions: np.ndarray,
+        returns: np.ndarray,
+        report: Callable[[str], None],
+        critic_only: bool,
+    ) -> None:
+        """Learn actions (rows, A) and returns (rows,) that follow observations (rows, D) by regression."""
         observations = torch.from_numpy(self.env.normalise(raw))
         targets = torch.from_numpy(actions.astype(np.float32))
-        networks = policy.layers()[critic_only:]
-        self.env.spread.update(returns)
+        networks = self.model.policy.layers()[critic_only:]
         values = torch.from_numpy((self.env.reward_scale * returns).astype(np.float32)).unsqueeze(1)
 
         def slopes(rows: torch.Tensor) -> None:
@@ -295,7 +323,7 @@ class Trainer:
                 differentiate(layers, found, 2.0 / excess.numel() * excess)
 
         chosen = (part for layers in networks for layer in layers for part in layer.parameters())
-        regress(chosen, len(observations), clone, seed, slopes, report)
+        regress(chosen, len(observations), clone, self.plan.seed, slopes, report)
 
     def update(self) -> Status:
         """Collect one rollout and learn from it.
@@ -305,8 +333,11 @@ class Trainer:
         """
         begin, cpu_begin = monotonic(), process_time()
         self._share = self._spent()
+        self.model.critic_alone = self.model.critic_alone and self._share < LONGEST_ALONE
         with self._finite():
             self.model.learn(self._rollout, callback=self._watch, reset_num_timesteps=False)
+        if self.model.critic_alone:
+            self.model.critic_alone = self.model.explained < (self.plan.settings.ppo.critic_first or 0.0)
         self.seconds += monotonic() - begin
         self.cpu_seconds += process_time() - cpu_begin
         return self.status

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,6 +16,7 @@ from safetensors.numpy import load_file
 
 import coopenv
 from coopenv.api.engine import Engine
+from coopenv.api.terms.layout import observation_layout
 from coopenv.api.trainers.sb3 import make_sb3_vec_env
 from coopenv.evaluation import Result, drive, held_out_seeds, score
 from coopenv.policies import Policy, load_agent
@@ -25,7 +27,7 @@ from coopenv.training.batches import LEAST_VARIANCE, NormalisedEnv
 from coopenv.training.command import train
 from coopenv.training.export import export, onnx_model
 from coopenv.training.settings import Clone, EvaluationSettings, Ppo, Settings, TrainingPlan, environment_file
-from coopenv.training.trainer import Trainer, Watch
+from coopenv.training.trainer import Trainer, Watch, watch
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.train
@@ -135,6 +137,53 @@ def test_a_rule_limits_the_speeds_of_training_and_agent(tmp_path: Path) -> None:
     agent = load_agent(tmp_path, trainer.scenario)
     assert agent(rows) == pytest.approx(trainer.mean_action(rows), abs=1e-5)
     assert agent.agents == list(trainer.scenario.vehicle_names)
+
+
+def test_the_critic_of_a_clone_learns_alone_at_first() -> None:
+    """The policy moves when the critic explains enough, or after a quarter of the steps; what it sees stays scaled."""
+    clone = Clone(agent="route_follower", episodes=2, epochs=1)
+    settings = Settings(ppo=SMALL.model_copy(update={"critic_first": 0.999}), steps=8 * 512, clone=clone)
+    trainer = Trainer(TrainingPlan(FOUR_WAY, settings, 0), coopenv.load_scenario(FOUR_WAY), threads=1)
+    trainer.begin()
+    states = [trainer.tensors()]
+    for _ in range(3):
+        trainer.update()
+        states.append(trainer.tensors())
+    for name in ("layers.0.weight", "layers.2.bias", "log_std"):
+        moved = [not np.array_equal(a[name], b[name]) for a, b in pairwise(states)]
+        assert moved == [False, False, True], name
+    assert not any(
+        np.array_equal(a["critic.layers.0.weight"], b["critic.layers.0.weight"]) for a, b in pairwise(states)
+    )
+    assert np.array_equal(states[0]["observation.mean"], states[-1]["observation.mean"])
+    explaining = trainer_of(steps=8 * 512, clone=clone)
+    explaining.begin()
+    explaining.model.explained = 1.0
+    assert explaining.model.critic_alone
+    explaining.model.train = lambda: None
+    explaining.update()
+    assert not explaining.model.critic_alone
+
+
+def test_after_the_first_round_the_clone_drives() -> None:
+    """A clone that stands stays where it starts, and the driver's actions would have led on."""
+    scenario, standing = coopenv.load_scenario(FOUR_WAY), lambda rows: np.tile([-1.0, 0.0], (len(rows), 1))
+    settings = Clone(agent="route_follower", noise=0.0)
+    driven, actions, *_ = watch(scenario, 2, settings, 0.99, 0, 1, lambda line: None)
+    stood, meant, *_ = watch(scenario, 2, settings, 0.99, 0, 1, lambda line: None, clone=standing)
+    forward = observation_layout(scenario)["velocity"].start
+    assert driven[:, forward].mean() > 10 * abs(stood[:, forward].mean())
+    assert meant[:8] == pytest.approx(actions[:8]) and meant[0, 0] > 0.0, "of the first step, before anything has moved"
+    seen: list[object] = []
+    trainer = trainer_of(steps=512, clone=Clone(agent="route_follower", episodes=4, rounds=2, epochs=1))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "coopenv.training.trainer.watch",
+            lambda *given: (seen.append((given[1], given[4], given[-1])), watch(*given))[1],
+        )
+        trainer.begin()
+    assert [(worlds, clone is not None) for worlds, _, clone in seen] == [(2, False), (2, True)]
+    assert len({seed for _, seed, _ in seen}) == 2, "other worlds"
 
 
 @pytest.mark.parametrize("broken", ["weights", "exploration"])

@@ -442,7 +442,7 @@ def test_a_training_continues_an_agent_with_its_critic(here: Path) -> None:
     assert trainer.notes == [] and {*after} == {*before}
     for name, values in before.items():
         assert "layers" not in name or np.array_equal(after[name], values), name
-    assert after["critic.counts"][0] == pytest.approx(before["critic.counts"][0] + 16), "the first observations"
+    assert after["critic.counts"][0] == pytest.approx(before["critic.counts"][0]), "the policy sees what it has learnt"
     without_critic(here / "first")
     trainer = Trainer(plan, possible(plan), threads=1)
     trainer.begin()

@@ -348,7 +348,12 @@ class LeanPpo(PPO):
     """SB3's `PPO` for a `TanhPolicy`, without `clip_range_vf`, `target_kl` and `use_sde`."""
 
     policy: TanhPolicy
+    rollout_buffer: ActingRowsBuffer
     clip_range: Schedule
+    critic_alone = False
+    """Whether the critic alone learns, and the policy stays as it is."""
+    explained = 0.0
+    """Share of the variance of the last rollout's returns that the critic explained, over rows that acted."""
 
     @torch.no_grad()
     def train(self) -> None:
@@ -361,6 +366,8 @@ class LeanPpo(PPO):
         figures = {name: float(np.mean([step[name] for step in steps])) for name in steps[0]}
         figures["approx_kl"] = float(np.mean([step["approx_kl"] for step in passes[-1]]))
         figures["loss"] = steps[-1]["loss"]
+        acted = buffer.swap_and_flatten(buffer.acted).flatten()
+        self.explained = float(explained_variance(buffer.values.flatten()[acted], buffer.returns.flatten()[acted]))
         figures["explained_variance"] = float(explained_variance(buffer.values.flatten(), buffer.returns.flatten()))
         figures["std"] = float(self.policy.log_std.exp().mean())
         for name, value in {**figures, "clip_range": clip}.items():
@@ -381,8 +388,10 @@ class LeanPpo(PPO):
         # Where the clipped ratio, a constant, gives the smaller gain, the loss does not depend on the density.
         free = torch.where(advantages > 0.0, ratio <= 1.0 + clip, ratio >= 1.0 - clip)
         slope = (free * advantages * ratio).div_(-count).unsqueeze(1)  # with respect to the logarithm of the density
-        differentiate(actor, found, slope * deviation * precision)
-        policy.log_std.grad = (slope * (deviation**2 - 1.0)).sum(0).sub_(self.ent_coef)
+        policy.optimizer.zero_grad()
+        if not self.critic_alone:
+            differentiate(actor, found, slope * deviation * precision)
+            policy.log_std.grad = (slope * (deviation**2 - 1.0)).sum(0).sub_(self.ent_coef)
         found = outputs(critic, rows.observations)
         excess = found[-1].squeeze(1) - rows.returns
         differentiate(critic, found, excess.mul(2.0 * self.vf_coef / count).unsqueeze(1))
