@@ -266,64 +266,47 @@ class Trainer:
                 nn.init.constant_(self.model.policy.log_std, math.log(self.plan.settings.ppo.initial_std))
             if COUNTS not in tensors:
                 self.notes.append(f"{start} was saved without a critic: a new one learnt from its episodes")
-                self._imitate(Clone(agent=start), report, critic_only=True)
         if self.plan.settings.clone is not None:
             self._imitate(self.plan.settings.clone, report)
         self.env.start()
 
     @torch.no_grad()
-    def _imitate(self, clone: Clone, report: Callable[[str], None], critic_only: bool = False) -> None:
+    def _imitate(self, clone: Clone, report: Callable[[str], None]) -> None:
         """Fit the mean action to a driver's actions, and the value to the discounted rewards that follow.
 
         The observations of the first round are also the first in the statistics for normalisation. Noise is added to
         all actions, so that corrections of deviations are recorded (Laskey et al. 2017).
         """
-        watched: list[tuple[np.ndarray, ...]] = []
+        env, networks, watched = self.env, self.model.policy.layers(), list[tuple[np.ndarray, ...]]()
         for part in range(clone.rounds):
             watched += self._watched(clone, part, report)
             raw, actions, returns, _ = (np.concatenate(column) for column in zip(*watched, strict=True))
             if part == 0:
-                if critic_only:
-                    self.env.statistics.count = len(raw)
-                else:
-                    self.env.statistics.update(raw)
-                self.env.spread.update(returns)
-            self._fit(clone, raw, actions, returns, report, critic_only)
-        self.env.looked_at.append(raw)
+                env.statistics.update(raw)
+                env.spread.update(returns)
+            observations = torch.from_numpy(env.normalise(raw))
+            values = (env.reward_scale * returns)[:, None]
+            targets = [torch.from_numpy(aims.astype(np.float32)) for aims in (actions, values)]
+            slopes = partial(self._differentiate, observations, targets)
+            chosen = (part for layers in networks for layer in layers for part in layer.parameters())
+            regress(chosen, len(observations), clone, self.plan.seed, slopes, report)
+        env.looked_at.append(raw)
 
     def _watched(self, clone: Clone, part: int, report: Callable[[str], None]) -> Iterator[tuple[np.ndarray, ...]]:
         """Yield what `watch` returns in the worlds of a round, by scenario."""
         all_worlds, threads = sum(count for _, count in self._scenarios), self.batch.engine.world.threads
+        driving = self.mean_action if part else None
         for place, (each, count) in enumerate(self._scenarios, part * len(self._scenarios)):
             worlds, start = max(1, clone.episodes * count // all_worlds // clone.rounds), self.plan.seed + APART * place
             rule = RightOfWay(each) if self.rule else None
-            yield watch(
-                each, worlds, clone, self.gamma, start, threads, report, rule, self.mean_action if part else None
-            )
+            yield watch(each, worlds, clone, self.gamma, start, threads, report, rule, driving)
 
-    def _fit(
-        self,
-        clone: Clone,
-        raw: np.ndarray,
-        actions: np.ndarray,
-        returns: np.ndarray,
-        report: Callable[[str], None],
-        critic_only: bool,
-    ) -> None:
-        """Learn actions (rows, A) and returns (rows,) that follow observations (rows, D) by regression."""
-        observations = torch.from_numpy(self.env.normalise(raw))
-        targets = torch.from_numpy(actions.astype(np.float32))
-        networks = self.model.policy.layers()[critic_only:]
-        values = torch.from_numpy((self.env.reward_scale * returns).astype(np.float32)).unsqueeze(1)
-
-        def slopes(rows: torch.Tensor) -> None:
-            for layers, aims in zip(networks, (targets[rows], values[rows])[critic_only:], strict=True):
-                found = outputs(layers, observations[rows])
-                excess = found[-1] - aims
-                differentiate(layers, found, 2.0 / excess.numel() * excess)
-
-        chosen = (part for layers in networks for layer in layers for part in layer.parameters())
-        regress(chosen, len(observations), clone, self.plan.seed, slopes, report)
+    def _differentiate(self, observations: torch.Tensor, targets: list[torch.Tensor], rows: torch.Tensor) -> None:
+        """Write the derivatives of the mean squared error of actions and values in some rows into `grad`."""
+        for layers, aims in zip(self.model.policy.layers(), targets, strict=True):
+            found = outputs(layers, observations[rows])
+            excess = found[-1] - aims[rows]
+            differentiate(layers, found, 2.0 / excess.numel() * excess)
 
     def update(self) -> Status:
         """Collect one rollout and learn from it.
