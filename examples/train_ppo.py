@@ -19,7 +19,7 @@ import csv
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +52,8 @@ class Arguments:
     """gradient steps per pass"""
     learning_rate: float = 1e-3
     """of Adam at the start; falls linearly to zero"""
-    gamma: float = 0.99
-    """discount per decision"""
+    gamma: float | None = None
+    """discount per decision; none: 1 - 1 / the decisions of an episode"""
     gae_lambda: float = 0.95
     """of the generalised advantage estimate"""
     clip: float = 0.2
@@ -320,6 +320,7 @@ def train(args: Arguments) -> list[dict[str, float]]:
         torch.set_num_threads(1)  # small matrices: more threads mostly wait for one another and for the worlds'
     torch.manual_seed(args.seed)
     env = coopenv.make_vec(args.env, num_worlds=args.num_worlds, device=args.device, arrays="torch")
+    args = replace(args, gamma=args.gamma or 1.0 - 1.0 / env.scenario.decisions)
     size, actions = env.single_observation_space.shape[0], env.single_action_space.shape[0]
     policy = Policy(size, actions, args.hidden, args.initial_std).to(args.device)
     optimiser = torch.optim.Adam(policy.parameters(), args.learning_rate, eps=1e-5)

@@ -12,6 +12,8 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from torchrl_env import batched_env
 
+import coopenv
+
 ROWS = "vehicle"
 ENVIRONMENT = "urban_crossing"
 EPOCHS = 8
@@ -36,7 +38,8 @@ def train(
         log_prob_key=(ROWS, "sample_log_prob"),
     )
     critic = TensorDictModule(MLP(size, 1, num_cells=[64, 64]), [(ROWS, "observation")], [(ROWS, "state_value")])
-    advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
+    discount = 1.0 - 1.0 / coopenv.load_scenario(ENVIRONMENT).decisions
+    advantage = GAE(gamma=discount, lmbda=0.95, value_network=critic)
     loss = ClipPPOLoss(policy, critic, normalize_advantage=True)
     keys = {name: (ROWS, name) for name in ("advantage", "value_target", "reward", "done", "terminated")}
     advantage.set_keys(value=(ROWS, "state_value"), **keys)
