@@ -83,12 +83,14 @@ class TrainOptions:
 
     def _settings(self, overrides: dict[str, Any]) -> Any:
         from coopenv.policies import find_agent
-        from coopenv.training.settings import SETTINGS_FILE, read_settings, usual_settings
+        from coopenv.training.settings import SETTINGS_FILE, continued_settings, read_settings, usual_settings
 
         path, changes = self.settings, {"steps": self.steps, "minutes": self.minutes, "start": self.start}
-        if path is None and self.arm is None and self.start is not None:  # as it was trained
+        name = Path(self.environment).stem
+        if self.start is not None and (path, self.arm, self.agent) == (None, None, None):
             beside = (find_agent(self.start).folder or Path()) / SETTINGS_FILE
-            path = beside if beside.is_file() and self.agent is None else None
+            if beside.is_file():
+                return continued_settings(beside, name, **changes)
         if self.agent is not None:
             if path is not None:
                 raise CoopenvError("--agent and --settings: give one of them")
@@ -98,7 +100,7 @@ class TrainOptions:
             path = folder / SETTINGS_FILE
         if path is None and self.arm is None:
             return usual_settings(self.environment, overrides, **changes)
-        return read_settings(path, self.arm, Path(self.environment).stem, **changes)
+        return read_settings(path, self.arm, name, **changes)
 
 
 @commands.command

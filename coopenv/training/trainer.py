@@ -262,7 +262,7 @@ class Trainer:
                 self.take(tensors)
             except (RuntimeError, KeyError, ValueError) as error:
                 raise CoopenvError(f"start: {start} has not the widths ppo.hidden = {[*widths]}: {error}") from None
-            if "initial_std" in self.plan.settings.ppo.model_fields_set:
+            if find_agent(start).training.get("steps") == 0:  # a clone alone, of which no exploration was learnt
                 nn.init.constant_(self.model.policy.log_std, math.log(self.plan.settings.ppo.initial_std))
             if COUNTS not in tensors:
                 self.notes.append(f"{start} was saved without a critic: a new one learnt from its episodes")

@@ -20,6 +20,7 @@ from coopenv.training.settings import (
     Settings,
     TrainingPlan,
     check_settings,
+    continued_settings,
     environment_file,
     read_settings,
     settings_digest,
@@ -76,6 +77,18 @@ def test_by_default_a_training_begins_as_the_planner_if_that_can_drive() -> None
     assert not blind.right_of_way, "the rule needs the map"
     assert usual_settings("open_square", {"observation.exclude": ["map"]}) == read_settings(None)
     assert usual_settings("large_crossing", {}).scenario == {}, "its reward is its own"
+
+
+def test_a_clone_alone_is_continued_in_small_steps_and_others_as_they_were() -> None:
+    folder = data_directory("agents")
+    team = read_settings(folder / "train.toml", "team", "lighthouse")
+    clone = continued_settings(folder / "lighthouse_team" / "train.toml", "lighthouse", start="lighthouse_team")
+    assert (clone.steps, clone.start, clone.clone) == (team.steps, "lighthouse_team", None)
+    assert clone.ppo == team.ppo.model_copy(update={"hidden": (128, 128)}) and clone.evaluation == team.evaluation
+    assert clone.scenario == read_settings(folder / "lighthouse_team" / "train.toml").scenario
+    path = folder / "facade_quality" / "train.toml"
+    learnt = continued_settings(path, "facade", start="facade_quality", steps=7)
+    assert learnt == read_settings(path, start="facade_quality", steps=7)
 
 
 VARIED = """

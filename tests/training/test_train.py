@@ -377,6 +377,13 @@ def test_a_clone_alone_is_an_agent(here: Path) -> None:
     card = read_card(here / "agent")
     assert card.training["steps"] == 0 and card.network and card.network.seen
     assert not (here / "agent" / "checkpoint.safetensors").exists()
+    (here / "agent").rename(here / "first")
+    settings = read_settings(here / "first" / "train.toml", start=str(here / "first"), steps=400)
+    settings = settings.model_copy(update={"ppo": settings.ppo.model_copy(update={"initial_std": 0.07})})
+    plan = TrainingPlan("urban_crossing", settings, 6)
+    trainer = Trainer(plan, possible(plan), threads=1)
+    trainer.begin()
+    assert np.exp(trainer.tensors()["log_std"]) == pytest.approx(0.07), "no exploration was learnt"
 
 
 CLONED = SETTINGS.replace("steps = 3000", "steps = 800").replace("every = 800", "every = 400")
