@@ -61,9 +61,9 @@ class Ppo(Section):
     """Lambda of the generalised advantage estimate (Schulman et al. 2016)."""
     clip: Positive = 0.2
     """Clipping range of the probability ratio."""
-    critic_first: Share | None = 0.8
+    critic_first: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.8
     """Share of the returns' variance that the critic explains before the policy of a clone, or of an agent that the
-    training continues, moves; after a quarter of the steps it moves in any case."""
+    training continues, moves; after a quarter of the steps it moves in any case. 0: at once."""
     entropy: NonNegative = 0.0
     """Weight of the entropy bonus."""
     value_weight: NonNegative = 0.5

@@ -248,7 +248,7 @@ class Trainer:
         )
         self.model.set_logger(Logger(None, []))
         self.env.settled = plan.settings.start is not None or plan.settings.clone is not None
-        self.model.critic_alone = self.env.settled and ppo.critic_first is not None
+        self.model.critic_alone = self.env.settled and ppo.critic_first > 0.0
         self._watch = Watch(self.batch)
         self.notes: list[str] = []
         """Remarks for the end."""
@@ -320,7 +320,7 @@ class Trainer:
         with self._finite():
             self.model.learn(self._rollout, callback=self._watch, reset_num_timesteps=False)
         if self.model.critic_alone:
-            self.model.critic_alone = self.model.explained < (self.plan.settings.ppo.critic_first or 0.0)
+            self.model.critic_alone = self.model.explained < self.plan.settings.ppo.critic_first
         self.seconds += monotonic() - begin
         self.cpu_seconds += process_time() - cpu_begin
         return self.status
