@@ -265,14 +265,15 @@ def read_settings(
 def continued_settings(path: Path, environment: str, **changes: Any) -> Settings:
     """Return the settings of a training that continues the agent of a file: its own ones.
 
-    Of a clone alone no value of PPO was ever in use: it goes on as the arm `team` does.
+    Of a clone alone neither reward nor PPO were ever in use: it goes on as the arm `team` does.
     """
     if read_toml(path).get("steps") != 0:
         return read_settings(path, None, environment, **changes)
-    team = read_settings(data_directory("agents") / SETTINGS_FILE, "team", environment)
-    own = read_settings(path, None, environment, **{**changes, "steps": changes.get("steps") or team.steps})
+    team = read_settings(data_directory("agents") / SETTINGS_FILE, "team", environment, **changes)
+    own = read_settings(path, None, environment, **{**changes, "steps": team.steps})
     ppo = team.ppo.model_copy(update={"hidden": own.ppo.hidden, "observation_clip": own.ppo.observation_clip})
-    return own.model_copy(update={"ppo": ppo, "evaluation": team.evaluation})
+    overrides = {key: value for key, value in own.scenario.items() if not key.startswith("reward.")}
+    return team.model_copy(update={"ppo": ppo, "scenario": {**team.scenario, **overrides}})
 
 
 def usual_settings(environment: str, overrides: Mapping[str, Any], **changes: Any) -> Settings:
