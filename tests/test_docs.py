@@ -11,12 +11,14 @@ import shlex
 import tomllib
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import typer
+from gymnasium.utils.play import play
 
 import coopenv
 from benchmarks.learning.study import read_study
@@ -94,15 +96,32 @@ def test_the_programs_on_terms_run(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 def test_the_programs_on_agents_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run(DOCS / "agents.md", "class Mine")
+    run(DOCS / "agents.md", "class Mine", "utils.play")
     lines = capsys.readouterr().out.splitlines()
     arrivals = [line for line in lines if "'arrival_rate'" in line]
     assert ["peek" in line for line in arrivals] == [False, True]
-    (tmp_path / "mine.py").write_text(python_blocks(DOCS / "agents.md")[1], encoding="utf-8")
+    (tmp_path / "mine.py").write_text(python_blocks(DOCS / "agents.md")[2], encoding="utf-8")
     scenario = load_scenario("urban_crossing")
     policy = load_agent(f"{tmp_path / 'mine.py'}:Mine", scenario)
     rows = np.zeros((3, observation_layout(scenario).size), dtype=np.float32)
     np.testing.assert_array_equal(policy(rows), [[0.0, 0.0]] * 3)
+
+
+def test_the_player_on_agents_drives_by_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a key the vehicle stands, and w held down drives ahead."""
+    pygame = pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    taken: list[list[float]] = []
+
+    def note(before: object, after: object, action: np.ndarray, *rest: object) -> None:
+        taken.append(action.tolist())
+        pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=ord("w")))
+        if len(taken) == 3:
+            pygame.event.post(pygame.event.Event(pygame.QUIT))
+
+    monkeypatch.setattr("gymnasium.utils.play.play", partial(play, callback=note, fps=1000, seed=0))
+    exec(compile(python_blocks(DOCS / "agents.md")[0], "agents.md", "exec"), {})
+    assert taken[:2] == [[-1.0, 0.0], [1.0, 0.0]]
 
 
 @pytest.mark.slow

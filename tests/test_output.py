@@ -70,7 +70,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ([*EVALUATE, "peek", "--worlds", "99999999999"], "Invalid value for '--worlds'"),
         ([*WATCH, "route_follower", "--out", "file"], "cannot write to file: it is not a folder"),
         (["watch", "route_follower", "--speed", "nan"], "Invalid value for '--speed'"),
-        (["play", "facade", "--others", "nobody"], "unknown policy 'nobody'"),
         (["run", "facade", "--set", "seed=3"], "seed: unknown key; allowed: action, backend,"),
         (["bench", "observers", "overtaking", "--observers", ""], "unknown observer ''; known: "),
         (["bench", "observers", "overtaking", "--seeds", "1000", "--out", "file"], "cannot write to file"),

@@ -1,4 +1,4 @@
-"""`coopenv view`, `film`, `watch` and `play`."""
+"""`coopenv view`, `film` and `watch`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -349,28 +349,3 @@ def watch(
             write_pictures(video_path(folder), fps, stage.pictures(policy, seed))
     for line in stage.outcomes():
         options.console().print(line, soft_wrap=True)
-
-
-def play(
-    environment: options.Environment,
-    vehicle: Annotated[str | None, typer.Option(help="Name of the vehicle to drive (default: the first).")] = None,
-    others: Annotated[
-        str | None,
-        typer.Option(
-            help="Policy of the other vehicles (default: route_follower where it can drive).",
-            **arguments.POLICY,
-        ),
-    ] = None,
-    seed: options.Seed = 0,
-    overrides: options.Overrides = None,
-) -> None:
-    """Drive a vehicle by the arrow keys."""
-    scenario, log = options.load(environment, options.parse_overrides(overrides)), options.console(stderr=True)
-    from coopenv.policies.base import zero_policy
-    from coopenv.runs import live
-    from coopenv.runs.scenes import driver_of
-
-    index = live.vehicle_index(scenario, vehicle, driven=True)
-    policy, _ = driver_of(others, scenario, environment, seed)
-    stage = live.drive_by_hand(scenario, index, policy or zero_policy(), seed, log)
-    options.console().print(stage.outcomes()[index], soft_wrap=True)

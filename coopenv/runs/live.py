@@ -1,4 +1,4 @@
-"""Episodes that are watched while they run: in a window, driven from the keyboard, or as frames of the live view."""
+"""Episodes that are watched while they run: in a window, or as frames of the live view."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -9,12 +9,11 @@ from rich.console import Console
 
 from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
-from coopenv.api.terms.layout import action_fields
 from coopenv.base.errors import CoopenvError, listed, suggest
 from coopenv.episode import Episode, Frame, Origin
 from coopenv.evaluation.episodes import play
 from coopenv.observers.registry import available_names
-from coopenv.policies import Policy, restart
+from coopenv.policies import Policy
 from coopenv.runs.console import compile_notice
 from coopenv.runs.recorder import source_of
 from coopenv.runs.scenes import MAX_FPS, frame_stride
@@ -24,65 +23,6 @@ from coopenv.viz.stage import vehicle_mark
 from coopenv.viz.topview import PictureWindow, TopView
 from coopenv.viz.topview_ground import HEIGHT, WIDTH
 from coopenv.viz.web_panel import Abilities
-
-LEAVE, AGAIN = {"escape", "q"}, {"r"}
-HELP = "Arrow keys: faster, slower, left, right. r: again. Escape: leave."
-FULL_SPEED, FULL_STEERING = 1.0, 0.4
-"""Time (s) of holding a key for the whole range: from standstill to top speed, from straight ahead to full steering."""
-
-
-class Keys:
-    """Keys that are held down in the window of a canvas."""
-
-    def __init__(self, canvas: Any) -> None:
-        """Listen to a canvas of matplotlib."""
-        self.held: set[str] = set()
-        self.struck: set[str] = set()
-        """Keys pressed since the set was cleared."""
-        canvas.mpl_connect("key_press_event", self._press)
-        canvas.mpl_connect("key_release_event", lambda event: self.held.discard(event.key))
-
-    def _press(self, event: Any) -> None:
-        if event.key is not None:
-            self.held.add(event.key)
-            self.struck.add(event.key)
-
-    def direction(self, plus: str, minus: str) -> float:
-        """Return 1, -1 or 0 by which of two keys is held."""
-        return float(plus in self.held) - float(minus in self.held)
-
-
-class Keyboard:
-    """A policy of one world that drives a vehicle by keys and leaves the others to another policy."""
-
-    def __init__(self, scenario: Scenario, vehicle: int, others: Policy, keys: Keys) -> None:
-        """Choose the driver of each vehicle; `vehicle` is an index."""
-        self.keys, self._vehicle, self._others = keys, vehicle, others
-        self._longitudinal = action_fields(scenario, scenario.limits[vehicle])[0]
-        self._period = 1.0 / scenario.rates.decision
-        self.reset(np.ones(len(scenario.vehicles), dtype=bool))
-
-    def reset(self, mask: np.ndarray) -> None:
-        """Begin anew, standing, with straight wheels."""
-        low, high = self._longitudinal.low, self._longitudinal.high
-        self._level = -(high + low) / (high - low)  # of nothing: no speed, no acceleration
-        self._still, self._steering = self._level, 0.0
-        restart(self._others, mask)
-
-    def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Return the actions, (vehicles, A)."""
-        actions = np.array(self._others(observations), dtype=float)
-        pedal, wheel = self.keys.direction("up", "down"), self.keys.direction("left", "right")
-        if self._longitudinal.name == "speed":
-            step = pedal * (1.0 - self._still) * self._period / FULL_SPEED
-            self._level = float(np.clip(self._level + step, -1.0, 1.0))
-        else:
-            self._level = pedal
-        step = self._period / FULL_STEERING
-        self._steering = float(np.clip(wheel, self._steering - step, self._steering + step))
-        actions[self._vehicle] = 0.0
-        actions[self._vehicle, :2] = self._level, self._steering
-        return actions
 
 
 class LiveWorld:
@@ -127,20 +67,6 @@ class LiveWorld:
         ]
 
 
-def opened(scenario: Scenario, window: PictureWindow | None, instead: str = "") -> PictureWindow:
-    """Return an open window, as it is needed before kernels are compiled; `instead` names a way without a display.
-
-    Raises:
-        CoopenvError: there is no display.
-    """
-    if window is None:
-        window = PictureWindow(scenario.title)
-        window.show(np.full((HEIGHT, WIDTH, 3), 255, np.uint8))
-    if not window.is_open:
-        raise CoopenvError(f"there is no display to open a window on{instead}")
-    return window
-
-
 def watch(
     scenario: Scenario, policy: Policy, seed: int, log: Console, window: PictureWindow | None = None, speed: float = 1.0
 ) -> LiveWorld:
@@ -149,60 +75,28 @@ def watch(
     Raises:
         CoopenvError: there is no display.
     """
-    shown = opened(scenario, window, "; --out DIR writes a film instead")
+    if window is None:
+        window = PictureWindow(scenario.title)
+        window.show(np.full((HEIGHT, WIDTH, 3), 255, np.uint8))  # before kernels are compiled
+    if not window.is_open:
+        raise CoopenvError("there is no display to open a window on; --out DIR writes a film instead")
     stage = LiveWorld(scenario, log)
-    stage.start(seed, shown)
-    stage.run(policy, seed, shown, speed, lambda: shown.is_open)
+    stage.start(seed, window)
+    stage.run(policy, seed, window, speed, lambda: window.is_open)
     return stage
 
 
-def drive_by_hand(
-    scenario: Scenario,
-    vehicle: int,
-    others: Policy,
-    seed: int,
-    log: Console,
-    window: PictureWindow | None = None,
-    speed: float = 1.0,
-) -> LiveWorld:
-    """Let the user drive a vehicle by the arrow keys, as often as wanted.
-
-    Raises:
-        CoopenvError: there is no display.
-    """
-    shown = opened(scenario, window)
-    stage = LiveWorld(scenario, log)
-    stage.start(seed, shown)
-    log.print(HELP)
-    keys = Keys(shown.canvas)
-    policy = Keyboard(scenario, vehicle, others, keys)
-    while True:
-        keys.struck.clear()
-        stage.run(policy, seed, shown, speed, lambda: shown.is_open and not keys.struck & (LEAVE | AGAIN))
-        if not keys.struck & AGAIN:
-            return stage
-        seed += 1
-
-
-def vehicle_index(scenario: Scenario, name: str | None, driven: bool = False) -> int:
+def vehicle_index(scenario: Scenario, name: str | None) -> int:
     """Return the index of a vehicle by its name or by f1, f2, ...; of the first without a name.
-
-    `driven`: of those alone that actions drive.
 
     Raises:
         CoopenvError: there is no such vehicle.
     """
-    pairs = enumerate(zip(scenario.vehicle_names, scenario.vehicles, strict=True))
-    known = {own: i for i, (own, vehicle) in pairs if not driven or vehicle.motion.kind == "driven"}
-    if not known:
-        raise CoopenvError("all motion here is prescribed, there is nothing to drive")
-    if name is None:
-        return min(known.values())
+    known = {own: i for i, own in enumerate(scenario.vehicle_names)}
     found = known | {vehicle_mark(i): i for i in known.values()}
-    if name not in found:
-        kind = "driven vehicle" if driven else "vehicle"
-        raise CoopenvError(f"--vehicle {name}: no such {kind}{suggest(name, known)}; known: {listed([*known])}")
-    return found[name]
+    if name is not None and name not in found:
+        raise CoopenvError(f"--vehicle {name}: no such vehicle{suggest(name, known)}; known: {listed([*known])}")
+    return 0 if name is None else found[name]
 
 
 class Reel:

@@ -28,11 +28,6 @@ class PictureWindow:
         self._image: Any = None
 
     @property
-    def canvas(self) -> Any:
-        """Matplotlib's canvas, which reports keys; None before the first picture and without a display."""
-        return None if self._image is None else self._image.figure.canvas
-
-    @property
     def is_open(self) -> bool:
         """True if the window exists and the user has not closed it."""
         if self._image is None:
@@ -49,8 +44,8 @@ class PictureWindow:
             self._silent = True
         elif self.is_open:
             self._image.set_data(picture)
-            self.canvas.draw_idle()
-            self.canvas.flush_events()
+            self._image.figure.canvas.draw_idle()
+            self._image.figure.canvas.flush_events()
 
     def close(self) -> None:
         """Close the window; the next picture opens a new one."""
@@ -76,7 +71,6 @@ def _opened(title: str, picture: np.ndarray) -> Any:
     ax = figure.add_axes((0, 0, 1, 1))
     ax.set_axis_off()
     manager: Any = figure.canvas.manager
-    figure.canvas.mpl_disconnect(manager.key_press_handler_id)  # keys are not matplotlib's here
     manager.set_window_title(title)
     manager.show()
     return ax.imshow(picture)
