@@ -37,7 +37,6 @@ BLOCK = 302
 """Block of held-out seeds on which neither rule nor team was tuned."""
 ABLATIONS = {
     "without messages": ("message_position", "message_forward", "message_mask", "message_age", "message_std"),
-    "without ages": ("message_age", "seen_age", "sighting_age", "map_age"),
     "without map": ("map_position", "map_in_view", "map_age"),
 }
 """Fields that are 0, by the name of the row."""
@@ -102,7 +101,8 @@ def report(environment: str, worlds: int, block: int, others: Sequence[str]) -> 
             f"`{environment}_team` reads, a vehicle's own observation. `team_look_ahead` reads all covariances. Mean "
             "of the position error from 3 s on, at most 1 m, which is that of a lost vehicle, and the difference in "
             f"the same worlds, over {worlds} held-out worlds of block {block}, with standard errors. In the last rows, "
-            "fields of the observation read 0.",
+            "fields of the observation read 0, for which the team was not trained: they show what it reads, not what "
+            "a team that is trained without these fields can do.",
             markdown(columns, rows),
             f"```\n{command}  # coopenv {version()}\n```",
         ]
