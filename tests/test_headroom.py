@@ -14,9 +14,11 @@ import pytest
 
 import coopenv
 from benchmarks.contact import measure
+from benchmarks.teams import ABLATIONS, Blanked, mean_errors
 from coopenv.api.engine import Engine
 from coopenv.bench.contest import Contest
 from coopenv.bench.evaluation import evaluated
+from coopenv.estimation import Outcome
 from coopenv.evaluation import Difference, Episodes, compare_paired, drive, held_out_seeds, ranking_key, score
 from coopenv.evaluation.metrics import scored_errors
 from coopenv.policies import load_agent
@@ -143,12 +145,6 @@ def test_drivers_rank_by_their_return_as_by_their_score(environment: str) -> Non
     assert len(agree) > len(agents) and 2.0 * np.mean(agree) - 1.0 >= 0.9, (agents, returns)
 
 
-def mean_errors(found: Episodes) -> np.ndarray:
-    """Return the mean of the scored errors, m, of each world, (W,)."""
-    errors, world = scored_errors(found)
-    return np.asarray(np.bincount(world, errors, found.worlds) / np.bincount(world, minlength=found.worlds))
-
-
 def dependent_e95(found: Episodes, environment: str) -> float:
     """Return the 95th percentile of the scored position error, m, of the vehicles that do not help, from 3 s on."""
     return float(np.quantile(scored_errors(found, vehicles=slice(HELPERS[environment], None))[0], 0.95))
@@ -193,6 +189,43 @@ def test_cooperation_is_learnt_from_what_each_vehicle_observes(environment: str)
     assert often["arrival_rate"][0] >= 0.97 and often["collision_rate"][0] < 0.01
     unseen = [dependent_e95(team_episodes(environment, agent, "cars unseen")[0], environment) for agent in agents]
     assert unseen[2] > 0.8 * unseen[0]
+
+
+AHEAD = ("pilot",)
+"""Environments whose learned team is ahead of the rule `ENV_rule`, which reads the same, and of the planners."""
+
+
+def against(
+    environment: str, agent: str, fields: tuple[str, ...] = (), worlds: int = 32
+) -> tuple[Episodes, np.ndarray]:
+    """Return the episodes of a driver, which reads 0 in some fields, and its mean errors (W,), m."""
+    scenario = load_scenario(environment)
+    policy = Blanked(scenario, load_agent(agent, scenario), fields)
+    found = drive(Engine(scenario, worlds), policy, held_out_seeds(9, worlds))
+    return found, mean_errors(found)
+
+
+@pytest.mark.parametrize("environment", AHEAD)
+def test_a_rule_for_a_team_needs_its_messages(environment: str) -> None:
+    rule, follower = (against(environment, agent, worlds=8)[1] for agent in (f"{environment}_rule", "route_follower"))
+    silent = against(environment, f"{environment}_rule", ABLATIONS["without messages"], 8)[1]
+    assert rule.mean() < 0.5 * min(follower.mean(), silent.mean())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", AHEAD)
+def test_a_learned_team_is_ahead_of_rule_and_planners(environment: str) -> None:
+    """Paired by world: arrivals not fewer, collisions not more, and ahead in mean error by three standard errors."""
+    team, errors = against(environment, f"{environment}_team")
+    arrived, collided = (team.arrivals[-1] > 0).mean(), (team.outcome == Outcome.COLLIDED).mean()
+    for agent in (f"{environment}_rule", "route_follower", "look_ahead", "team_look_ahead"):
+        other, others = against(environment, agent)
+        ahead = others - errors
+        assert ahead.mean() > 3.0 * ahead.std(ddof=1) / np.sqrt(len(ahead)), agent
+        assert arrived >= (other.arrivals[-1] > 0).mean() and collided <= (other.outcome == Outcome.COLLIDED).mean()
+        assert np.mean(team_return(team, environment) > team_return(other, environment)) >= 0.95, agent
+    lost = against(environment, f"{environment}_team", ABLATIONS["without messages"])[1] - errors
+    assert lost.mean() > 3.0 * lost.std(ddof=1) / np.sqrt(len(lost))
 
 
 GENERAL = ("open_square", "facade", "behind_truck", "urban_crossing")
