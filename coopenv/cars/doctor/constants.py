@@ -29,6 +29,8 @@ GAIN = 5.0
 """Gain of the linearised cost from which a hypothesis is fitted: a third of the gain that calibration accepts."""
 SIGHTINGS, POSES = 1200, 25.0
 """Sightings, and poses of motion capture in a second, that are enough: what counts as wrong is coarser."""
+SHARED = 0.25
+"""Share of the misfit by which a coarse cause is looked for with motion capture."""
 COARSE = 2.0
 """Times the deviation that counts as wrong in a calibration, below which constants are no finding here."""
 
@@ -86,8 +88,13 @@ def _wrong(batch: Batch, fit: Fit, name: str) -> Iterator[Finding]:
             yield Finding(title, text, float(fit.x[worst]), float(error[worst]), key, car=name)
 
 
-def _coarse(drive: CalibrationDrive, name: str, bad: float = BAD) -> Iterator[tuple[Finding, CalibrationDrive]]:
-    """Yield causes of misfits above `bad` without motion capture, and the drive without each and those before."""
+def _coarse(
+    drive: CalibrationDrive, name: str, bad: float = SHARED * BAD
+) -> Iterator[tuple[Finding, CalibrationDrive]]:
+    """Yield causes of misfits above `bad` without motion capture, and the drive without each and those before.
+
+    Poses follow a wrong stream in part, so that less of its misfit is left. Then the cause has to remove more of it.
+    """
     for _ in range(ROUNDS):
         (car,), batch = drive.cars, Batch(replace(drive, places=drive.places.copy()), False)
         if (given := _windows(drive)) < bad:
@@ -101,7 +108,7 @@ def _coarse(drive: CalibrationDrive, name: str, bad: float = BAD) -> Iterator[tu
         found = [Finding("markers", text, treatment=refused, car=name) for text in texts]
         tried += [(found, replace(drive, places=batch.places))] if pairs else []
         least, n = min((_windows(changed), n) for n, (_, changed) in enumerate(tried))
-        if least > REMOVED * given:
+        if least > given * (REMOVED if given > BAD else REMOVED * REMOVED):
             if not pairs:
                 return
             n = len(tried) - 1  # with a criterion of its own

@@ -26,7 +26,8 @@ from coopenv.estimation.poses import Array
 FEWEST, MOST = 12, 300  # sightings
 BAD = 0.004
 """Mean misfit, of angles of 3.6 deg, above which a coarse cause is looked for; smaller ones are calibration's."""
-OFF_DEG = 3.6
+OFF_DEG, MOST_OFF = 3.6, 0.8
+"""Angle of a ray that is off, deg, and share of the rays to a landmark that is elsewhere."""
 REMOVED = 0.35
 """Share of the misfit that the cause leaves at most."""
 SMALL_DEG, SMALL_LOG, SMALL_M = 6.0, math.log(1.2), 0.3
@@ -60,6 +61,11 @@ class PosedSightings:
     def misfit(self) -> float:
         """Return the mean of (2 sin(angle / 2))^2 up to 0.04 between rays and markers."""
         return float(misfits(self.ray, self.ahead))
+
+    def is_bad(self) -> bool:
+        """Return whether a coarse cause is looked for: all rays misfit, or most of those to one landmark."""
+        counts, off = np.bincount(self.target), np.bincount(self.target, self.off_deg() > OFF_DEG)
+        return self.misfit() >= BAD or bool((off > MOST_OFF * np.maximum(counts, FEWEST)).any())
 
 
 def thinned(car: CarStreams) -> CarStreams | None:
@@ -305,7 +311,7 @@ FAR = 10.0
 
 def of_sight(given: CarStreams) -> Iterator[Diagnosis]:
     """Yield the causes, at most two, of a coarse misfit between bearings, map and motion capture."""
-    if (car := thinned(given)) is None or (sight := sight_of(car)).misfit() < BAD:
+    if (car := thinned(given)) is None or not (sight := sight_of(car)).is_bad():
         return
     topic, found, changed = car.topic([Role.TRUTH]), explanation(car), car
     for cause in found:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -76,6 +77,10 @@ class Sample:
     value: Value
     stated: Stated = NOTHING  # beside the value, untested
 
+    def at(self, stamp: int, received: int) -> "Sample":
+        """Return the sample with other times."""
+        return Sample(self.car, self.role, stamp, received, self.value, self.stated)
+
 
 PLAIN = VisionSettings()
 """Tags of the usual family in frames of a global shutter."""
@@ -100,7 +105,12 @@ ASYMMETRY = 1e-3
 
 def covariance_of(values: Any) -> Array | None:
     """Return a covariance (6, 6); None: it is not known. Zeros, -1, NaN, and what is no covariance mean that."""
-    matrix = np.array(values, dtype=np.float64).reshape(6, 6)
+    return _covariance(np.asarray(values, dtype=np.float64).tobytes())
+
+
+@lru_cache(maxsize=256)  # most messages of a topic have the same
+def _covariance(values: bytes) -> Array | None:
+    matrix = np.frombuffer(values).reshape(6, 6)
     diagonal = matrix.diagonal()
     if not (np.abs(matrix) <= 1e12).all() or not matrix.any() or (diagonal < 0.0).any():
         return None
@@ -297,7 +307,8 @@ def _turning(message: Any) -> Twist:
 
 def _pose_with_covariance(pose: Any) -> CarPose:
     """Return the pose of a PoseWithCovariance."""
-    return replace(placed(pose.pose), covariance=covariance_of(pose.covariance))
+    place = placed(pose.pose)
+    return CarPose(place.position, place.rotation, covariance_of(pose.covariance))
 
 
 def placed(pose: Any) -> CarPose:

@@ -27,7 +27,6 @@ NOTHING = Stated()
 def stated(message: Any) -> Stated:
     """Return what a message states beside its value; fields that are absent or of another kind count as not stated."""
     header = getattr(message, "header", None)
-    region = getattr(message, "roi", None)
     return _stated(
         str(getattr(header, "frame_id", ""))[:LONGEST_FRAME],
         str(getattr(message, "child_frame_id", ""))[:LONGEST_FRAME],
@@ -35,8 +34,7 @@ def stated(message: Any) -> Stated:
         _variances(
             getattr(getattr(message, "twist", None), "covariance", getattr(message, "angular_velocity_covariance", ()))
         ),
-        tuple(max(1, int(getattr(message, f"binning_{axis}", 1))) for axis in "xy"),
-        tuple(int(getattr(region, name, 0)) for name in ("x_offset", "y_offset", "width", "height")),
+        *(_pixels(message) if hasattr(message, "roi") else ()),
     )
 
 
@@ -44,7 +42,14 @@ _stated = lru_cache(maxsize=256)(Stated)
 """Most messages of a topic state the same."""
 
 
+def _pixels(message: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return binning and region of a CameraInfo."""
+    sides = ("x_offset", "y_offset", "width", "height")
+    binning = tuple(max(1, int(getattr(message, f"binning_{axis}", 1))) for axis in "xy")
+    return binning, tuple(int(getattr(message.roi, name, 0)) for name in sides)
+
+
 def _variances(covariance: Any) -> tuple[float, ...]:
     """Return the diagonal of a covariance, as a list of the rows of a matrix 6 x 6 or 3 x 3."""
     side = {36: 6, 9: 3}.get(np.size(covariance))
-    return () if side is None else tuple(float(value) for value in covariance[:: side + 1])
+    return () if side is None else tuple(np.asarray(covariance[:: side + 1], dtype=np.float64).tolist())
