@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from coopenv.cars.bags.clocks import CAMERAS
 from coopenv.cars.calibration.batch import misfits, seen_from
 from coopenv.cars.calibration.calibrate import INTRINSICS
+from coopenv.cars.calibration.drives import LEAST_SECONDS
 from coopenv.cars.doctor.finding import Change, Diagnosis, Finding, Treatment, with_error
 from coopenv.cars.doctor.streams import CarStreams, Planar
 from coopenv.cars.messages.vision import Calibration, rays
@@ -69,13 +70,16 @@ class PosedSightings:
 
 
 def thinned(car: CarStreams) -> CarStreams | None:
-    """Return a car with few of its sightings, all with a pose; None: too few, or the map has a single place."""
+    """Return a car with few of its sightings, all with a pose; None: the map has a single place, or they are too few.
+
+    Within a short time all are from one place, from which many causes look alike.
+    """
     if len(car.places) < 2 or not np.ptp(car.places, axis=0).any() or car.truth_signals is None:
         return None
     rows = np.arange(len(car.time))[:: max(1, len(car.time) // MOST)]
     pose = np.column_stack([signal.over(car.time[rows], car.time[rows], level=True) for signal in car.truth_signals])
     rows = rows[np.isfinite(pose).all(axis=1)]
-    if len(rows) < FEWEST:
+    if len(rows) < FEWEST or np.ptp(car.time[rows]) < LEAST_SECONDS:
         return None
     return replace(car, time=car.time[rows], target=car.target[rows], ray=car.ray[rows])
 

@@ -94,7 +94,7 @@ def vector(value: Any, field: str, most: float) -> Array:
 def numbers_of(values: Any, field: str, most: float) -> Array:
     """Return numbers as an array. Raises CoopenvError: one is not finite, or larger than `most`."""
     numbers = np.array(values, dtype=np.float64)
-    if not (np.abs(numbers) <= most).all():
+    if not all(abs(number) <= most for number in numbers.tolist()):
         raise CoopenvError(f"{field}: {shown(numbers.tolist())} is not finite, or beyond {most:g}")
     return numbers
 
