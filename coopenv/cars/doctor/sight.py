@@ -368,3 +368,13 @@ def _far(car: CarStreams, sight: PosedSightings) -> str:
     width = float(np.linalg.norm(np.ptp(flat, axis=0)))
     away = float(np.median(np.abs(sight.place[:, None] - (flat[:, 0] + 1j * flat[:, 1])).min(axis=1)))
     return f"{away:.3g} m from landmarks that span {width:.3g} m" if width and away > FAR * width else ""
+
+
+def exchanged_bodies(one: CarStreams, other: CarStreams) -> list[CarStreams]:
+    """Return two cars with each other's motion capture, if bearings of both misfit and fit with that; or none."""
+    names, given = ("truth_time", "truth", "truth_yaw"), [thinned(one), thinned(other)]
+    if not all(car is not None and sight_of(car).misfit() > BAD for car in given):
+        return []
+    right = [a.with_tracks(**{name: b.tracks[name] for name in names}) for a, b in ((one, other), (other, one))]
+    fitting = [thinned(car) for car in right]
+    return right if all(car is not None and sight_of(car).misfit() < BAD for car in fitting) else []
