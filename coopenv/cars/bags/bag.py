@@ -12,20 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.base.errors import (
-    CoopenvError,
-    DataError,
-    DataWarning,
-    ScenarioWarning,
-    UnknownEnvironmentError,
-    check_one_of,
-    listed,
-)
+from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning, check_one_of, listed
 from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.binding import OPTIONS, bind, reset_options
 from coopenv.cars.bags.files import check_extra
 from coopenv.cars.bags.log import read_log
-from coopenv.cars.bags.topic_map import UNNEEDED, TopicMap, TopicMapError, load_map
+from coopenv.cars.bags.topic_map import UNNEEDED, TopicMap, load_map
 from coopenv.cars.bags.topics import NS
 from coopenv.cars.doctor.finding import Treatment
 from coopenv.cars.doctor.streams import Streams
@@ -101,10 +93,7 @@ class Bag(TickGenerator):
         self.where = ", ".join(str(path) for path in paths)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ScenarioWarning)  # repeated below
-            try:
-                scenario = load_scenario(self.map.environment_path, changes)
-            except UnknownEnvironmentError as error:
-                raise TopicMapError(f"{self.map.path.name}: environment: {error}") from None
+            scenario = load_scenario(self.map.environment_path, changes)
         self._rate = float(scenario.rates.camera)
         where = self.map.path.name
         self.binding = bind(scenario, self.map.cars, self.map.markers, where, None, self.map.make, calibrated=False)

@@ -113,8 +113,7 @@ INTERVAL = 0.4  # s over which turns and distances are compared
 SEARCHED, COARSE, STEP = 1.0, 0.1, 0.02
 """Search range of an offset to both sides, and steps of the search and of that around its result, s."""
 FINE = round(2.0 * COARSE / STEP)
-THINNED, SETTLED = 1_000, 0.01
-"""Elements that are enough for the search, and share of the least error by which the offset moves at last."""
+THINNED = 1_000  # elements that are enough for the search
 BLOCK = 2.0  # s within which errors are taken as dependent
 SURE = 4.0  # standard errors above which an offset counts
 FLOOR, PARALLAX = 0.001, 0.015
@@ -243,17 +242,14 @@ def lead_by(residual: Residual, times: Array, most: float, least: float, *, scal
         information = float((w * slope**2).sum())
         if information <= 0.0:
             return None
-        move = float(np.clip((w * slope * rest).sum() / information, -STEP, STEP))
-        offset -= move
-        if abs(move) < SETTLED * least:
-            break
+        offset -= float(np.clip((w * slope * rest).sum() / information, -STEP, STEP))
     sums = np.bincount(((times - times.min()) / BLOCK).astype(int), w * slope * rest)
     return Lead(offset, float(np.hypot(np.sqrt((sums**2).sum()) / information, least)))
 
 
 def _common(given: Sequence[tuple[Array, Array]]) -> NDArray[np.bool_]:
     """Return of which elements (n,) there is a value at every offset."""
-    return np.logical_and.reduce([np.isfinite(np.column_stack(each)).all(axis=1) for each in given])
+    return np.asarray(np.logical_and.reduce([np.isfinite(np.column_stack(each)).all(axis=1) for each in given]))
 
 
 def lead_of_motion(signal: SampledSignal, reference: SampledSignal, least: float = FLOOR) -> Lead | None:

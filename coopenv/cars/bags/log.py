@@ -266,7 +266,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     drifts = {track.chosen.topic: drift for track in drifting if (drift := track.remove_drift(tolerance))}
     clocks = reconcile(delays, tolerance, stated)
     streams = Streams(
-        samples_of(tracks, clocks),
+        samples_of(tracks, clocks, {}),
         binding,
         {(entry.car, entry.role): entry.topic for entry in chosen},
         lenses,

@@ -134,7 +134,6 @@ class Track:
         return delay.drift
 
 
-NO_MOVES: Mapping[str, int] = {}
 APART = NS  # ns between the delays of two topics of a car beyond which they have different clocks
 
 
@@ -158,7 +157,7 @@ def delays_of(tracks: Sequence[Track], files: int, tolerance: float, stated: Col
     return [*found]
 
 
-def samples_of(tracks: Sequence[Track], clocks: Clocks, moves: Mapping[str, int] = NO_MOVES) -> tuple[Sample, ...]:
+def samples_of(tracks: Sequence[Track], clocks: Clocks, moves: Mapping[str, int]) -> tuple[Sample, ...]:
     """Return the samples, each once, in the order of their stamps, to which `moves` are added by topic, ns."""
     found: dict[tuple[Chosen, int], Sample] = {}
     for track in tracks:

@@ -100,9 +100,9 @@ def examined(
     """Return, of live cars that have moved, the streams that others contradict by a known cause; nothing is mended.
 
     What a bag mends is refused here: gate and watchdog use the streams as they come. So is wrong motion capture, by
-    which the distances of cars are judged. Poor detections are left out here, too. Other findings stay warnings. Contradictions without a known cause are the
-    watchdog's, which compares estimates. From one place many causes look alike, so that cars that have stood are left
-    out.
+    which the distances of cars are judged. Poor detections are left out here, too. Other findings stay warnings.
+    Contradictions without a known cause are the watchdog's, which compares estimates. From one place many causes look
+    alike, so that cars that have stood are left out.
 
     Args:
         samples: in the order of their stamps.

@@ -283,6 +283,8 @@ SLOW = math.radians(1.0)
 """rad/s of a turn that is no more than a bias: of robots that hold a command, and whose odometry is the command."""
 NOISY = 0.02
 """Share of equal neighbours below which values have noise."""
+SPIN = 6.0
+"""rad/s, faster than a car turns: a body of motion capture whose markers were mistaken."""
 STUCK = 0.15
 """m by which a position by wheels and one by motion capture may differ over such a time, 0.15 m/s for a second."""
 
@@ -334,8 +336,9 @@ def _frozen_velocity(car: CarStreams) -> Iterator[Diagnosis]:
 def _frozen_turning(car: CarStreams) -> Iterator[Diagnosis]:
     for begin, end, first, inside in _repeated(car, "gyro"):
         rate = float(car.tracks["gyro"][first]) + 0.0  # no negative zero
-        yaw = np.unwrap(car.tracks["truth_yaw"][inside])
-        turned = float(np.ptp(yaw - rate * car.tracks["truth_time"][inside]))
+        steps = np.diff(car.tracks["truth_time"][inside])
+        turns = np.diff(np.unwrap(car.tracks["truth_yaw"][inside])) - rate * steps
+        turned = float(np.ptp(np.cumsum(np.where(np.abs(turns) < SPIN * steps, turns, 0.0))))
         if turned > max(TURNED, SLOW * (end - begin)):
             text = f"the turn rate of {car.name} is {rate:.3g} rad/s in a row for {end - begin:.1f} s, in which "
             text += f"motion capture turns it by {math.degrees(turned):.0f} deg"

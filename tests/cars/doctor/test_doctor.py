@@ -399,6 +399,17 @@ def test_the_scale_of_wheels_is_that_of_the_arc_in_tight_turns() -> None:
     assert body is not None and abs(body.factor - 1.2) < max(0.002, 3.0 * body.error)
 
 
+def test_a_heading_of_motion_capture_that_jumps_contradicts_no_turn_rate() -> None:
+    """A body whose markers are mistaken for 1.6 s, of a car that drives straight on with a turn rate of 0."""
+    t = np.arange(0.0, 20.0, 0.05)
+    tracks = {"truth_time": t, "truth": 0.3 * t + 0j, "truth_yaw": np.where((t > 8.0) & (t < 9.6), 0.4, 0.0)}
+    tracks |= {"wheel_time": t, "wheel": 0.3 + 0.01 * np.random.default_rng(0).normal(size=len(t)) + 0j}
+    car: Any = SimpleNamespace(
+        name="car", tracks=tracks | {"gyro_time": t, "gyro": 0.0 * t}, topic=lambda roles: "/imu"
+    )
+    assert not [*of_frozen_streams(car)]
+
+
 def test_a_velocity_that_sticks_after_a_stand_is_found() -> None:
     t = np.arange(0.0, 40.0, 0.02)
     place = 0.3 * np.maximum(t - 20.0, 0.0) + 0j
