@@ -66,20 +66,17 @@ class PosedSightings:
     def is_bad(self) -> bool:
         """Return whether a coarse cause is looked for: all rays misfit, or most of those to one landmark."""
         counts, off = np.bincount(self.target), np.bincount(self.target, self.off_deg() > OFF_DEG)
-        return self.misfit() >= BAD or bool((off > MOST_OFF * np.maximum(counts, FEWEST)).any())
+        return self.misfit() >= BAD or bool(((off > MOST_OFF * counts) & (counts >= FEWEST)).any())
 
 
 def thinned(car: CarStreams) -> CarStreams | None:
-    """Return a car with few of its sightings, all with a pose; None: the map has a single place, or they are too few.
-
-    Within a short time all are from one place, from which many causes look alike.
-    """
+    """Return a car with few of its sightings, all with a pose; None: too few, or the map has a single place."""
     if len(car.places) < 2 or not np.ptp(car.places, axis=0).any() or car.truth_signals is None:
         return None
     rows = np.arange(len(car.time))[:: max(1, len(car.time) // MOST)]
     pose = np.column_stack([signal.over(car.time[rows], car.time[rows], level=True) for signal in car.truth_signals])
     rows = rows[np.isfinite(pose).all(axis=1)]
-    if len(rows) < FEWEST or np.ptp(car.time[rows]) < LEAST_SECONDS:
+    if len(rows) < FEWEST:
         return None
     return replace(car, time=car.time[rows], target=car.target[rows], ray=car.ray[rows])
 
@@ -314,10 +311,13 @@ FAR = 10.0
 
 
 def of_sight(given: CarStreams) -> Iterator[Diagnosis]:
-    """Yield the causes, at most two, of a coarse misfit between bearings, map and motion capture."""
+    """Yield the causes, at most two, of a coarse misfit between bearings, map and motion capture.
+
+    A short drive has none: from one place many look alike.
+    """
     if (car := thinned(given)) is None or not (sight := sight_of(car)).is_bad():
         return
-    topic, found, changed = car.topic([Role.TRUTH]), explanation(car), car
+    topic, found, changed = car.topic([Role.TRUTH]), explanation(car) if np.ptp(car.time) > LEAST_SECONDS else [], car
     for cause in found:
         changed = cause.change(changed)
     rest = f", and {sight_of(changed).off_share():.0%} with that mended" if found else ""

@@ -337,9 +337,10 @@ def test_a_short_sound_drive_is_silent(seconds: float, seed: int) -> None:
 
 
 @pytest.mark.parametrize("begin", [0.0, 4.0, 8.0, 12.0, 16.0])
-def test_four_seconds_on_the_map_of_another_room_accuse_nothing(begin: float) -> None:
+def test_four_seconds_on_the_map_of_another_room_have_no_cause(begin: float) -> None:
     other = streams_of(None, places=PLACES[[2, 3, 1, 4, 0]] * [0.8, 1.2, 1.0] + [0.3, -0.2, 0.0])
-    assert not examine(replace(other, samples=cut(driven(), begin, 4.0))).findings
+    found = examine(replace(other, samples=cut(driven(), begin, 4.0))).findings
+    assert all(f.subject == "/car/truth" and "no single cause" in f.text for f in found)
 
 
 def test_motion_capture_of_two_cars_that_is_exchanged_is_named_for_both() -> None:
@@ -373,7 +374,7 @@ def test_a_landmark_elsewhere_is_named_where_few_bearings_are_to_it() -> None:
     """The mean over all bearings is below what counts as bad."""
     car = streams_of(None).car("car")
     rows = np.flatnonzero(car.target != 1)
-    rows = np.sort(np.append(rows, np.flatnonzero(car.target == 1)[::4]))
+    rows = np.sort(np.append(rows, np.flatnonzero(car.target == 1)[::2]))
     car = replace(car, time=car.time[rows], target=car.target[rows], ray=car.ray[rows])
     places = car.places.copy()
     places[1, 0] += 1.5
