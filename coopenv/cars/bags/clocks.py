@@ -11,7 +11,7 @@ Statistical Association 63, 1968.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,8 +110,10 @@ def checked(stamps: Times, received: Times) -> tuple[NDArray[np.bool_], Delay | 
 
 HOLE = 0.25  # s between two messages over which nothing is compared
 INTERVAL = 0.4  # s over which turns and distances are compared
-SEARCHED, STEP = 1.0, 0.02
-"""Search range of an offset to both sides, and step of the search, s."""
+SEARCHED, COARSE, STEP = 1.0, 0.1, 0.02
+"""Search range of an offset to both sides, and steps of the search and of that around its result, s."""
+FINE = round(2.0 * COARSE / STEP)
+THINNED = 1_000  # elements that are enough for the search
 BLOCK = 2.0  # s within which errors are taken as dependent
 SURE = 4.0  # standard errors above which an offset counts
 FLOOR, PARALLAX = 0.001, 0.015
@@ -173,8 +175,11 @@ class SampledSignal:
         return change
 
 
-Residual = Callable[[float], tuple[Array, Array]]
-"""Returns at an offset in s a difference (n,), and what explains it up to factors (n, p); NaN where there is none."""
+Residual = Callable[[float, slice], tuple[Array, Array]]
+"""Returns at an offset in s, of some of the elements, a difference (n,), and what explains it up to factors (n, p).
+
+NaN where there is none.
+"""
 
 
 def fit(e: Array, N: Array, w: Array | None = None, *, scaled: bool = False) -> tuple[Array, Array]:
@@ -202,31 +207,35 @@ def lead_by(residual: Residual, times: Array, most: float, least: float, *, scal
     """
     if len(times) < FEWEST:
         return None
-    tried = np.arange(-SEARCHED, SEARCHED + STEP / 2, STEP)
+    rows, tried = slice(None, None, 1 + len(times) // THINNED), np.arange(-SEARCHED, SEARCHED + STEP / 2, COARSE)
+    given = [residual(offset, rows) for offset in tried]
     # Costs of different elements cannot be compared: only those count for which there is a value at every offset.
-    common = np.logical_and.reduce([np.isfinite(np.column_stack(residual(o))).all(axis=1) for o in tried[::5]])
-    if common.sum() < FEWEST:
+    if (common := _common(given)).sum() < FEWEST:
         return None
 
-    def compared(offset: float) -> tuple[Array, Array]:
-        difference, explained = residual(offset)
-        return np.where(common, difference, np.nan), explained
-
-    def cost(offset: float) -> float:
-        rest, w = fit(*compared(offset), scaled=scaled)
+    def cost(difference: Array, explained: Array) -> float:
+        rest, w = fit(np.where(common, difference, np.nan), explained, scaled=scaled)
         return float((w * rest**2).sum() / w.sum()) if w.sum() >= FEWEST else np.inf
 
-    costs = np.array([cost(offset) for offset in tried])
+    costs = np.array([cost(*each) for each in given])
+    fine = np.arange(max(-SEARCHED, tried[np.argmin(costs)] - COARSE), SEARCHED + STEP / 2, STEP)[: FINE + 1]
+    costs = np.append(costs, [cost(*residual(offset, rows)) for offset in fine])
+    tried = np.append(tried, fine)
     best, known = int(np.argmin(costs)), costs[np.isfinite(costs)]
-    if best in (0, len(tried) - 1) or len(known) < len(tried) / 2:
+    if abs(tried[best]) > SEARCHED - STEP / 2 or len(known) < len(tried) / 2:
         return None
     if costs[best] > min(UNEXPLAINED * known.max(), most**2):
         return None
     blocks = max(1.0, float(np.ptp(times)) / BLOCK)
-    possible = np.flatnonzero(costs <= costs[best] * math.exp(SURE**2 / blocks))  # by the ratio of likelihoods
-    if STEP * np.ptp(possible) > SEARCHED:  # as of an even speed: nearly any offset
-        return None
-    offset, h = float(tried[best]), STEP / 4
+    if np.ptp(tried[costs <= costs[best] * math.exp(SURE**2 / blocks)]) > SEARCHED:  # by the ratio of likelihoods
+        return None  # as of an even speed: nearly any offset is possible
+    offset, h, every = float(tried[best]), STEP / 4, slice(None)
+    common = _common([residual(offset + k * STEP, every) for k in (-2, -1, 0, 1, 2)])
+
+    def compared(offset: float) -> tuple[Array, Array]:
+        difference, explained = residual(offset, every)
+        return np.where(common, difference, np.nan), explained
+
     for _ in range(5):
         rest, w = fit(*compared(offset))
         slope = (fit(*compared(offset + h), w)[0] - fit(*compared(offset - h), w)[0]) / (2 * h)
@@ -238,6 +247,11 @@ def lead_by(residual: Residual, times: Array, most: float, least: float, *, scal
     return Lead(offset, float(np.hypot(np.sqrt((sums**2).sum()) / information, least)))
 
 
+def _common(given: Sequence[tuple[Array, Array]]) -> NDArray[np.bool_]:
+    """Return of which elements (n,) there is a value at every offset."""
+    return np.asarray(np.logical_and.reduce([np.isfinite(np.column_stack(each)).all(axis=1) for each in given]))
+
+
 def lead_of_motion(signal: SampledSignal, reference: SampledSignal, least: float = FLOOR) -> Lead | None:
     """Return the lead of the stamps of turns or distances, by another source of the same."""
     span = reference.times[-1] - reference.times[0]
@@ -245,8 +259,9 @@ def lead_of_motion(signal: SampledSignal, reference: SampledSignal, least: float
     end, one = begin + INTERVAL, np.ones((len(begin), 1))
     change = reference.over(begin, end)[:, 0]
 
-    def residual(offset: float) -> tuple[Array, Array]:
-        return change, np.concatenate([signal.over(begin - offset, end - offset), one], axis=-1)
+    def residual(offset: float, rows: slice) -> tuple[Array, Array]:
+        moved = signal.over(begin[rows] - offset, end[rows] - offset)
+        return change[rows], np.concatenate([moved, one[rows]], axis=-1)
 
     return lead_by(residual, begin, np.inf, least, scaled=True)
 
@@ -261,12 +276,13 @@ def lead_of_bearings(times: Array, azimuths: Array, targets: Array, camera: Arra
     unit = np.exp(1j * azimuths)
     powers = np.vander(np.angle(unit * np.conj(unit.sum())), 4)
 
-    def residual(offset: float) -> tuple[Array, Array]:
-        x, y, heading = path.over(times + offset, times + offset, level=True).T
-        away = targets - np.column_stack([x, y])
+    def residual(offset: float, rows: slice) -> tuple[Array, Array]:
+        when = times[rows] + offset
+        x, y, heading = path.over(when, when, level=True).T
+        away = targets[rows] - np.column_stack([x, y])
         ahead = (away[:, 0] + 1j * away[:, 1]) * np.exp(-1j * heading) - complex(*camera)
-        shift = unit * (1.0 / np.abs(ahead))  # NaN beyond the path, without a warning
-        return np.angle(ahead * np.conj(unit)), np.column_stack([powers, shift.real, shift.imag])
+        shift = unit[rows] * (1.0 / np.abs(ahead))  # NaN beyond the path, without a warning
+        return np.angle(ahead * np.conj(unit[rows])), np.column_stack([powers[rows], shift.real, shift.imag])
 
     return lead_by(residual, times, ABSURD, FLOOR)
 

@@ -60,7 +60,7 @@ def value_reader(
     """
     known, turning = frozenset(binding.targets), {entry.car for entry in chosen if entry.role is Role.IMU}
     right = Correction()
-    frames = {Role.TRUTH: given.frames.truth or given.frames.map}
+    frames, here = {Role.TRUTH: given.frames.truth or given.frames.map}, MapFrame()
 
     def read_value(entry: Chosen, message: Any, known_already: CarPose | None) -> Value:
         calibration = calibrations.get(entry.car)
@@ -74,7 +74,8 @@ def value_reader(
             kept: dict[str, Any] = {"markers": markers, "bearings": value.bearings[there], "qualities": qualities}
             value = replace(value, dropped=value.dropped + len(others), **kept)
         if isinstance(value, CarPose):
-            return in_frame(value, frames.get(entry.role, given.frames.map))
+            frame = frames.get(entry.role, given.frames.map)
+            return value if frame == here else in_frame(value, frame)
         if isinstance(value, Twist):
             return given.corrections.get(entry.car, right).twist(value, entry.role, entry.car in turning)
         return value
@@ -278,7 +279,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     fixed = {track.chosen.topic for track in tracks if track.source in stated}
     behind = {track.chosen.topic: seconds for track in tracks if (seconds := track.behind(clocks)) is not None}
     moves = moves_of(leads, chosen, tolerance / NS, fixed, behind)
-    samples = samples_of(tracks, clocks, moves)
+    samples = samples_of(tracks, clocks, moves) if examined.mends or moves else streams.samples
     for entry in chosen:
         if entry.topic in moves and entry.car in examined.cars:
             own = examined.cars[entry.car]

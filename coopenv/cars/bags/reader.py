@@ -62,7 +62,7 @@ def in_reader(make: Callable[[], Iterator[Record]], size: int) -> Iterator[Recor
         _run_child(make, send, size)
     os.close(send)
     try:
-        with os.fdopen(receive, "rb") as stream:
+        with os.fdopen(receive, "rb", buffering=2**16) as stream:
             finished = yield from _received(stream)
     finally:
         os.kill(child, signal.SIGKILL)

@@ -247,8 +247,4 @@ def _ros1_records(stream: BinaryIO, allowance: Allowance) -> Iterator[tuple[dict
     raise EOFError(ENDS_EARLY)
 
 
-FORMS: dict[str, Callable[[Path, Allowance], Entries]] = {
-    ".mcap": _of_mcap,
-    ".db3": _of_sqlite3,
-    ".bag": _of_ros1,
-}
+FORMS: dict[str, Callable[[Path, Allowance], Entries]] = {".mcap": _of_mcap, ".db3": _of_sqlite3, ".bag": _of_ros1}

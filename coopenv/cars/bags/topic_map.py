@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from coopenv.base.errors import CoopenvError, DataError, check_one_of, listed, suggest
+from coopenv.base.installation import SCENES, scenario_path
 from coopenv.base.sections import Section, read_toml, validated
 from coopenv.cars.messages.readings import READERS
 from coopenv.cars.settings.deployment import Car, Marker, refuse_repeated, with_tables
@@ -200,9 +201,13 @@ class TopicMap(Section):
 
     @property
     def environment_path(self) -> str:
-        """The environment as `load_scenario` takes it."""
-        beside = self.path.parent / self.environment
-        return str(beside) if self.environment.endswith(".toml") else self.environment
+        """The environment as `load_scenario` takes it. Raises TopicMapError: there is none."""
+        name = str(self.path.parent / self.environment) if self.environment.endswith(".toml") else self.environment
+        try:
+            _ = name.partition(":")[0] in SCENES or scenario_path(name)
+        except CoopenvError as error:
+            raise TopicMapError(f"{self.path.name}: environment: {error}") from None
+        return name
 
 
 def load_map(path: str | Path) -> TopicMap:

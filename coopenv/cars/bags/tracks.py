@@ -14,7 +14,7 @@ or a topic whose delay is far from those of the other topics of its car.
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -95,7 +95,7 @@ class Track:
         """Let messages whose time of reception is 0, before the recorder's clock was set, be received as the others."""
         dated = [entry for entry in self.entries if entry.received]
         usual = int(np.median([entry.received - entry.stamp for entry in dated if entry.stamp] or [0]))
-        early = [replace(e, received=e.stamp + usual) for e in self.entries if not e.received and e.stamp]
+        early = [e.at(e.stamp, e.stamp + usual) for e in self.entries if not e.received and e.stamp]
         self.refused["received at 0, without a stamp"] += len(self.entries) - len(dated) - len(early)
         self.refused, self.entries = +self.refused, early + dated
 
@@ -109,7 +109,8 @@ class Track:
         self.jumps = list(jumps(stamps[given], received[given]).items()) if mode == "auto" else []
         for k, behind in self.jumps:
             stamps[np.flatnonzero(given)[k:]] += behind
-        self.entries = [replace(e, stamp=int(s)) for e, s in zip(self.entries, stamps, strict=True)]
+        if self.jumps:
+            self.entries = [e.at(int(s), e.received) for e, s in zip(self.entries, stamps, strict=True)]
         wrong, self.delay = checked(stamps, received)
         self.outlying += int(wrong.sum())
         self.entries = [entry for entry, off in zip(self.entries, wrong, strict=True) if not off]
@@ -129,7 +130,7 @@ class Track:
             return 0.0
         for k, entry in enumerate(self.entries):
             gained = round(delay.drift * (entry.received - delay.middle)) if entry.stamp else 0
-            self.entries[k] = replace(entry, stamp=entry.stamp + gained)
+            self.entries[k] = entry.at(entry.stamp + gained, entry.received)
         return delay.drift
 
 
@@ -164,7 +165,7 @@ def samples_of(tracks: Sequence[Track], clocks: Clocks, moves: Mapping[str, int]
         moved = moves.get(track.chosen.topic, 0)
         for entry in track.entries:
             time = entry.stamp + added.added + moved if entry.stamp and added else entry.received + recorder
-            found.setdefault((track.chosen, time), replace(entry, stamp=time, received=time))
+            found.setdefault((track.chosen, time), entry.at(time, time))
     return tuple(sorted(found.values(), key=lambda sample: sample.stamp))
 
 
@@ -188,7 +189,7 @@ def common_rate(tracks: Sequence[Track]) -> Finding | None:
         step = 1.0 - float(np.median([track.delay.drift for track in known if track.delay is not None]))
         rate *= step
         for track in tracks:
-            track.entries = [replace(e, received=begin + round(step * (e.received - begin))) for e in track.entries]
+            track.entries = [e.at(e.stamp, begin + round(step * (e.received - begin))) for e in track.entries]
             track.clean_stamps("stamps")
     error = float(np.std(drifts) / np.sqrt(len(drifts)))
     size = with_error(1e6 * (1.0 - rate), max(1.0, 1e6 * error))

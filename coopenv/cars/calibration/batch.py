@@ -42,7 +42,7 @@ LEAST_PIXEL, LEAST_ANGLE, LEAST_PLACE, LEAST_YAW = 0.2, 5e-4, 1e-3, 2e-3
 """Least standard deviations of a sighting (pixels; rad without pixels) and of motion capture (m, rad)."""
 LEAST_SPEED, LEAST_TURN = 1e-6, 1e-7  # m^2/s and rad^2/s, least densities of odometry noise
 WINDOW = 6.0  # s of sightings from which a first pose is found
-HEADINGS = 72  # that are tried for it
+HEADINGS = 36  # that are tried for it; the finer ones about the best reach beyond half a step
 LATE = np.arange(-0.5, 0.51, 0.05)  # s, offsets of motion capture that are tried
 
 
@@ -262,7 +262,8 @@ class Batch:
         bent = tuple((np.array(lens.distortion) + change[4 : 4 + len(lens.distortion)]).tolist())
         radius = np.linalg.norm(flat, axis=-1, keepdims=True)
         most = max(2.0, 1.2 * float((np.linalg.norm(car.ray[:, :2], axis=-1) / car.ray[:, 2]).max()))
-        flat = flat * np.minimum(1.0, min(largest_radius(bent), most) / np.maximum(radius, 1e-9))
+        reach = largest_radius(tuple(round(value, 4) for value in bent))  # the same for steps of derivatives
+        flat = flat * np.minimum(1.0, min(reach, most) / np.maximum(radius, 1e-9))
         return np.asarray(
             car.pixel
             - distort(flat, bent) * (np.array(lens.focal_length) + change[:2])
@@ -445,20 +446,23 @@ def seen_from(unit: Array, lever: Array, point: Array) -> tuple[float, float, co
 
     With a heading given, the place is linear in the sightings: all headings are tried together, then finer ones.
     """
-    across = skew(unit)
-    flat = across[:, :, :2]
-    squares = np.einsum("nik,nil->nkl", flat, flat)
+    across, (x, y, z) = skew(unit), point.T
+    flat, none = across[:, :, :2], np.zeros_like(z)
+    squares = np.einsum("nik,nil->nkl", flat, flat).reshape(-1, 4)
+    parts = [np.stack(part, axis=-1) for part in ((x, y, none), (y, -x, none), (none, none, z))]
+    parts[2] -= lever  # the three go with cosine, sine and 1
+    rows = np.concatenate([np.einsum("nik,nij,nj->nk", flat, across, part) for part in parts], axis=-1)
 
     def fitted(headings: NDArray[Any]) -> tuple[float, float, complex]:
-        turn = np.exp(-1j * headings)[:, None] * (point[:, 0] + 1j * point[:, 1])
-        to = np.stack([turn.real, turn.imag, np.broadcast_to(point[:, 2], turn.shape)], axis=-1) - lever
-        moments = np.einsum("nik,nij,hnj->hnk", flat, across, to, optimize=True)
-        ahead, weight = to, np.ones(turn.shape)
+        turn = np.stack([np.cos(headings), np.sin(headings), np.ones(len(headings))], axis=-1)
+        to = np.tensordot(turn, parts, axes=1)
+        ahead, weight = to, np.ones(to.shape[:2])
         for _ in range(2):
-            information = np.einsum("hn,nkl->hkl", weight, squares) + 1e-9 * np.eye(2)
-            shift = np.linalg.solve(information, np.einsum("hn,hnk->hk", weight, moments)[..., None])[..., 0]
+            information = (weight @ squares).reshape(-1, 2, 2) + 1e-9 * np.eye(2)
+            moments = np.einsum("hp,hpk->hk", turn, (weight @ rows).reshape(-1, 3, 2))
+            shift = np.linalg.solve(information, moments[..., None])[..., 0]
             ahead = to - np.append(shift, np.zeros((len(shift), 1)), axis=1)[:, None]
-            weight = np.maximum(np.linalg.norm(ahead, axis=-1), 0.1) ** -2
+            weight = 1.0 / np.maximum((ahead**2).sum(axis=-1), 0.01)
         missed = misfits(unit, ahead)
         best = int(np.argmin(missed))
         place = np.exp(1j * headings[best]) * complex(*shift[best])

@@ -57,7 +57,13 @@ class ConstantRow:
     given: float
     value: float
     error: float  # standard
-    finding: str  # "wrong", "not determined by this drive", `WITHIN` or nothing
+    finding: str = ""  # "wrong", "not determined by this drive", `WITHIN` or nothing
+
+    @property
+    def change(self) -> str:
+        """Given and estimated value, with its standard error."""
+        numbers = f"{self.given:.5g} -> {self.value:.5g} +- {self.error:.2g} {self.unit}"
+        return f"{self.name.split('.', 1)[1]} {numbers}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -226,16 +232,13 @@ def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]
     batch.prior = wide
     rows = {}
     for n in np.flatnonzero(batch.known):
-        kind, factor = batch.kinds[n], np.degrees(1.0) if batch.kinds[n].unit == "deg" else 1.0
         judged = ((bad, "wrong"), (loose, "not determined by this drive"), (within, WITHIN))
         finding = next((words for found, words in judged if found[n]), "")
-        old, value, std = (factor * float(v) for v in (batch.base[n], batch.base[n] + x[n], error[n]))
-        rows[int(n)] = ConstantRow(kind.name, kind.unit, old, value, std, finding)
+        rows[int(n)] = row_of(batch, int(n), x, error, finding)
     names = batch.drive.landmarks
     lines = [*reasons, *(f"markers {names[i]} and {names[j]} are exchanged" for i, j in pairs)]
     for title, part in parts_of(batch).items():
-        found = [rows[n] for n in part if bad[n]]
-        changes = [f"{r.name.split('.', 1)[1]} {r.given:.5g} -> {r.value:.5g} +- {r.error:.2g} {r.unit}" for r in found]
+        changes = [rows[n].change for n in part if bad[n]]
         lines += [f"{title} is wrong: {', '.join(changes)}"] if changes else []
     topics = ((car.name, topic, added) for car in batch.cars for topic, added in car.topics if abs(added) > FINEST["s"])
     notes = tuple(f"{name}: import has moved the stamps of {topic} by {added:+.3f} s" for name, topic, added in topics)
@@ -245,6 +248,13 @@ def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]
             lines.append(f"{car.name}: camera and motion capture agree, so that the stamps of wheels and IMU are wrong")
     noise = {} if reasons else _noise(batch, fit)
     return Calibrated(batch, given, fit, tuple(rows.values()), tuple(lines), notes, noise, not reasons)
+
+
+def row_of(batch: Batch, n: int, x: Array, error: Array, finding: str = "") -> ConstantRow:
+    """Return the row of a constant by deviations and standard errors (G,) of all."""
+    kind, factor = batch.kinds[n], np.degrees(1.0) if batch.kinds[n].unit == "deg" else 1.0
+    values = (factor * float(v) for v in (batch.base[n], batch.base[n] + x[n], error[n]))
+    return ConstantRow(kind.name, kind.unit, *values, finding)
 
 
 def unexplained(batch: Batch, fit: Fit) -> Iterator[str]:

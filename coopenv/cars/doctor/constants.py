@@ -1,6 +1,5 @@
 """Checks of constants by the least squares of `coopenv calibrate`, of which a score test finds those worth a fit."""
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -9,18 +8,11 @@ import numpy as np
 
 from coopenv.base.errors import DataError
 from coopenv.cars.calibration.batch import Batch, Fit
-from coopenv.cars.calibration.calibrate import (
-    corrected,
-    errors,
-    exchanged,
-    parts_of,
-    unexplained,
-    wrong,
-)
+from coopenv.cars.calibration.calibrate import corrected, errors, exchanged, parts_of, row_of, unexplained, wrong
 from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive
 from coopenv.cars.doctor.finding import Finding, Treatment
 from coopenv.cars.doctor.motion import SPEED_FACTORS
-from coopenv.cars.doctor.sight import BAD, REMOVED
+from coopenv.cars.doctor.sight import BAD, MIRRORS, REMOVED, UNITS
 from coopenv.cars.messages.vision import rays
 
 ROUNDS = 3  # times that a cause is looked for without motion capture
@@ -29,6 +21,8 @@ GAIN = 5.0
 """Gain of the linearised cost from which a hypothesis is fitted: a third of the gain that calibration accepts."""
 SIGHTINGS, POSES = 1200, 25.0
 """Sightings, and poses of motion capture in a second, that are enough: what counts as wrong is coarser."""
+BLIND = 0.25 * BAD
+"""Mean misfit above which a coarse cause is looked for without motion capture."""
 COARSE = 2.0
 """Times the deviation that counts as wrong in a calibration, below which constants are no finding here."""
 
@@ -71,23 +65,18 @@ def _wrong(batch: Batch, fit: Fit, name: str) -> Iterator[Finding]:
     error = errors(batch, fit)
     bad, _ = wrong(batch, fit, error, COARSE)
     for title, part in parts_of(batch).items():
-        rows = [n for n in part if bad[n]]
-        changes = []
-        for n in rows:
-            kind, factor = batch.kinds[n], math.degrees(1.0) if batch.kinds[n].unit == "deg" else 1.0
-            old, new = factor * batch.base[n], factor * (batch.base[n] + fit.x[n])
-            changes.append(
-                f"{kind.name.split('.', 1)[1]} {old:.4g} -> {new:.4g} +- {factor * error[n]:.2g} {kind.unit}".rstrip()
-            )
-        if rows:
+        if rows := [n for n in part if bad[n]]:
             worst = max(rows, key=lambda n: abs(fit.x[n]) / error[n])
-            text = f"a wrong constant: {', '.join(changes)}"
+            text = f"a wrong constant: {', '.join(row_of(batch, n, fit.x, error).change for n in rows)}"
             key = "the file of `coopenv calibrate` (calibration = ...)"
             yield Finding(title, text, float(fit.x[worst]), float(error[worst]), key, car=name)
 
 
-def _coarse(drive: CalibrationDrive, name: str, bad: float = BAD) -> Iterator[tuple[Finding, CalibrationDrive]]:
-    """Yield causes of misfits above `bad` without motion capture, and the drive without each and those before."""
+def _coarse(drive: CalibrationDrive, name: str, bad: float = BLIND) -> Iterator[tuple[Finding, CalibrationDrive]]:
+    """Yield causes of misfits above `bad` without motion capture, and the drive without each and those before.
+
+    Poses follow a wrong stream in part, so that less of its misfit is left. Then the cause has to remove more of it.
+    """
     for _ in range(ROUNDS):
         (car,), batch = drive.cars, Batch(replace(drive, places=drive.places.copy()), False)
         if (given := _windows(drive)) < bad:
@@ -101,7 +90,7 @@ def _coarse(drive: CalibrationDrive, name: str, bad: float = BAD) -> Iterator[tu
         found = [Finding("markers", text, treatment=refused, car=name) for text in texts]
         tried += [(found, replace(drive, places=batch.places))] if pairs else []
         least, n = min((_windows(changed), n) for n, (_, changed) in enumerate(tried))
-        if least > REMOVED * given:
+        if least > given * (REMOVED if given > BAD else REMOVED * REMOVED):
             if not pairs:
                 return
             n = len(tried) - 1  # with a criterion of its own
@@ -116,26 +105,20 @@ def _windows(drive: CalibrationDrive) -> float:
 
 def _changes(drive: CalibrationDrive, car: CarDrive) -> Iterator[tuple[str, CarDrive, np.ndarray]]:
     """Yield causes, and the streams and the map without them."""
-    places = drive.places
+    places, lens = drive.places, car.lens
     for what, factor in SPEED_FACTORS.items():
-        wheel = car.wheel / factor
-        yield (
-            f"the velocity of {car.name} is {factor:.4g} times that by bearings ({what})",
-            replace(car, wheel=wheel),
-            places,
-        )
+        text = f"the velocity of {car.name} is {factor:.4g} times that by bearings ({what})"
+        yield text, replace(car, wheel=car.wheel / factor), places
     for what, signs in (("image is mirrored", [-1.0, 1.0, 1.0]), ("image is upside down", [-1.0, -1.0, 1.0])):
         yield f"its {what}", replace(car, ray=car.ray * signs), places
-    if (lens := car.lens) is not None:
-        for factor in (0.5, 2.0):
-            fx, fy, cx, cy = (factor * value for value in (*lens.focal_length, *lens.principal_point))
-            right = replace(lens, focal_length=(fx, fy), principal_point=(cx, cy), image_size=(100_000, 100_000))
-            ray, there = rays(car.pixel, right)
-            names = ("time", "target", "pixel")
-            seen: dict[str, Any] = {name: getattr(car, name)[there] for name in names}
-            seen |= {"ray": ray[there], "lens": right}
-            yield f"its focal length is {1.0 / factor:g} times that of its images", replace(car, **seen), places
-    for what, signs in (("x", [-1.0, 1.0, 1.0]), ("y", [1.0, -1.0, 1.0])):
-        yield f"the map is mirrored: {what} has the other sign", car, places * signs
-    for unit, metres in (("mm", 1e-3), ("cm", 1e-2)):
+    for factor in (0.5, 2.0) if lens is not None else ():
+        fx, fy, cx, cy = (factor * value for value in (*lens.focal_length, *lens.principal_point))
+        right = replace(lens, focal_length=(fx, fy), principal_point=(cx, cy), image_size=(100_000, 100_000))
+        ray, there = rays(car.pixel, right)
+        seen: dict[str, Any] = {name: getattr(car, name)[there] for name in ("time", "target", "pixel")}
+        changed = replace(car, ray=ray[there], lens=right, **seen)
+        yield f"its focal length is {1.0 / factor:g} times that of its images", changed, places
+    for what, sign in MIRRORS.items():
+        yield f"the map is mirrored: {what}", car, places * [*sign, 1.0]
+    for unit, metres in UNITS.items():
         yield f"positions of landmarks are in {unit}, and not in m", car, places * metres

@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import combinations
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from coopenv.cars.calibration.drives import CalibrationDrive
 from coopenv.cars.doctor.constants import of_constants
 from coopenv.cars.doctor.finding import Diagnosis, Finding, Treatment
 from coopenv.cars.doctor.motion import of_frozen_streams, of_turning, of_velocity, turns_contradict
-from coopenv.cars.doctor.sight import of_sight
+from coopenv.cars.doctor.sight import exchanged_bodies, of_sight
 from coopenv.cars.doctor.streams import MOVING, TURNING, CarStreams, Streams
 from coopenv.cars.doctor.turning import constant_turn_rate
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist
@@ -75,9 +76,15 @@ def examine(
 
 def examine_cars(cars: Iterable[CarStreams], trusted: Collection[str] = ()) -> Examined:
     """Return what is wrong with the streams of cars, as `examine` does."""
-    found = Examined()
-    for car in cars:
-        name, diagnoses = car.name, diagnosed(car)
+    found, by_name = Examined(), {car.name: car for car in cars}
+    for one, other in combinations([*by_name], 2):
+        if right := exchanged_bodies(by_name[one], by_name[other]):
+            text, key = f"motion capture of {one} and {other} is exchanged", "the key `body` of both cars"
+            about = [Finding(car.topic([Role.TRUTH]), text, key=key, car=car.name) for car in right]
+            found.findings += [treated(finding, trusted) for finding in about]
+            by_name |= {car.name: car for car in right}
+    for name, car in by_name.items():
+        diagnoses = diagnosed(car)
         found.cars[name] = changed(car, diagnoses)
         for each in diagnoses:
             mend, finding = _mend_of(each.finding, car), treated(each.finding, trusted)

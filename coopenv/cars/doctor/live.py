@@ -17,7 +17,7 @@ from coopenv.cars.messages.readings import Sample, Twist
 from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.profile import Role
 
-KEPT = 6_000  # samples of a car, some 20 s
+KEPT, MOST = 20_000_000_000, 60_000  # ns of the last samples of a car, and samples
 MOVED = 0.3  # m
 LASTS = 1_000_000_000  # ns for which a result holds
 
@@ -33,7 +33,7 @@ class StreamMonitor:
     ) -> None:
         """Begin without samples; `trusted` are subjects of findings that do not count, `lenses` those of cameras."""
         self._binding, self._trusted, self._lenses = binding, trusted, lenses or {}
-        self._kept = {car: deque[Sample](maxlen=KEPT) for car in binding.cars}
+        self._kept = {car: deque[Sample](maxlen=MOST) for car in binding.cars}
         self._rates: dict[str, float] = {}
         self._turning: set[str] = set()
         self._constant: dict[str, str] = {}  # last contradictions, which stand until a turn rate changes
@@ -47,14 +47,20 @@ class StreamMonitor:
             self._kept[car].clear()
 
     def put(self, sample: Sample) -> None:
-        """Take a sample, with the turn rate that is used, or a command."""
-        if sample.car not in self._kept:
+        """Take a sample, with the turn rate that is used, or a command; earlier ones of a later time are forgotten."""
+        if (kept := self._kept.get(sample.car)) is None:
             return
+        if kept and sample.received < kept[-1].received - LASTS:  # the clock was set back
+            self._looked = 0
+            for each in self._kept.values():
+                each.clear()
+        while kept and kept[0].received < sample.received - KEPT:
+            kept.popleft()
         if isinstance(sample.value, Twist) and sample.value.angular is not None:
             rate = float(sample.value.angular[2])
             if self._rates.setdefault(sample.car, rate) != rate:
                 self._turning.add(sample.car)
-        self._kept[sample.car].append(sample)
+        kept.append(sample)
 
     def contradiction(self, car: str) -> str | None:
         """Return what contradicts a turn rate that never changes, see `constant_turn_rate`."""
@@ -94,9 +100,9 @@ def examined(
     """Return, of live cars that have moved, the streams that others contradict by a known cause; nothing is mended.
 
     What a bag mends is refused here: gate and watchdog use the streams as they come. So is wrong motion capture, by
-    which the distances of cars are judged. Other findings stay warnings. Contradictions without a known cause are the
-    watchdog's, which compares estimates. From one place many causes look alike, so that cars that have stood are left
-    out.
+    which the distances of cars are judged. Poor detections are left out here, too. Other findings stay warnings.
+    Contradictions without a known cause are the watchdog's, which compares estimates. From one place many causes look
+    alike, so that cars that have stood are left out.
 
     Args:
         samples: in the order of their stamps.
@@ -110,8 +116,9 @@ def examined(
     streams = Streams(samples, binding, topics, lenses or {})
     found = examine(streams, trusted, moved)
     given = [*found.findings, *(examine_constants(found, partial(drive_of_car, streams), trusted) if constants else ())]
-    counted = [f for f in given if f.explained and f.treatment not in (Treatment.TRUSTED, Treatment.LEFT_OUT)]
     truth = {topic for (_, role), topic in topics.items() if role is Role.TRUTH}
+    counted = [f for f in given if f.explained and f.treatment is not Treatment.TRUSTED]
+    counted = [f for f in counted if f.treatment is not Treatment.LEFT_OUT or f.subject in truth]
     refused = [replace(f, treatment=Treatment.REFUSED) if f.subject in truth else f for f in counted]
     refused = [replace(f, treatment=Treatment.REFUSED) if f.treatment in REMOVED else f for f in refused]
     return {car: [f for f in refused if f.car == car] for car in found.cars}

@@ -54,11 +54,7 @@ LEAST = 0.05
 
 def bearing_turn(car: CarStreams) -> SampledSignal | None:
     """Return the heading by the median change of the azimuths of landmarks, translation included; None: too few."""
-    if len(car.time) < 2:
-        return None
-    body = car.ray @ car.mounting.T
-    places = np.stack([car.target.astype(np.float64), np.zeros(len(car.target))], axis=-1)
-    return turn_of(car.time, np.arctan2(body[:, 1], body[:, 0]), places)
+    return turn_of(*car.sightings_in_plane) if len(car.time) > 1 else None
 
 
 def turning_factor(car: CarStreams, heading: SampledSignal, axis: int = 2) -> Relation | None:
@@ -285,17 +281,35 @@ FROZEN = 1.0
 """s, least duration of equal values in a row."""
 SLOW = math.radians(1.0)
 """rad/s of a turn that is no more than a bias: of robots that hold a command, and whose odometry is the command."""
+NOISY = 0.02
+"""Share of equal neighbours below which values have noise."""
+SPIN = 6.0
+"""rad/s, faster than a car turns: a body of motion capture whose markers were mistaken."""
 STUCK = 0.15
 """m by which a position by wheels and one by motion capture may differ over such a time, 0.15 m/s for a second."""
 
 
 def of_frozen_streams(car: CarStreams) -> Iterator[Diagnosis]:
     """Yield streams that repeat a value while another one shows that the car moves."""
-    tracks = car.tracks
-    if len(tracks["truth_time"]) < 3 or len(tracks["wheel_time"]) < 2:
-        return
-    for found in (_frozen_velocity, _frozen_turning, _frozen_truth):
+    known = len(car.tracks["truth_time"]) > 2 and len(car.tracks["wheel_time"]) > 1
+    for found in (_frozen_velocity, _frozen_turning, _frozen_truth) if known else (_frozen_noise,):
         yield from islice(found(car), 1)
+
+
+def _frozen_noise(car: CarStreams) -> Iterator[Diagnosis]:
+    """Yield streams with noise of their own that repeat a value other than 0, which needs no other stream."""
+    for kind, what, roles in (("wheel", "velocity", MOVING), ("gyro", "turn rate", TURNING)):
+        time, values = car.tracks[f"{kind}_time"], car.tracks[kind]
+        same, inside, runs = np.diff(values) == 0.0, np.zeros(max(0, len(time) - 1), bool), [*frozen(time, values)]
+        for begin, end, _ in runs:
+            inside |= (time[1:] > begin) & (time[1:] <= end)
+        if inside.all() or same[~inside].mean() > NOISY:
+            continue
+        for begin, end, first in runs:
+            if values[first]:
+                text = f"the {what} of {car.name} is {values[first].real:.4g} in a row for {end - begin:.1f} s"
+                text += ", and has noise before or after"
+                yield Diagnosis(Finding(car.topic(roles), text, treatment=Treatment.REFUSED, car=car.name))
 
 
 def _repeated(car: CarStreams, kind: str) -> Iterator[tuple[float, float, int, NDArray[np.bool_]]]:
@@ -322,8 +336,9 @@ def _frozen_velocity(car: CarStreams) -> Iterator[Diagnosis]:
 def _frozen_turning(car: CarStreams) -> Iterator[Diagnosis]:
     for begin, end, first, inside in _repeated(car, "gyro"):
         rate = float(car.tracks["gyro"][first]) + 0.0  # no negative zero
-        yaw = np.unwrap(car.tracks["truth_yaw"][inside])
-        turned = float(np.ptp(yaw - rate * car.tracks["truth_time"][inside]))
+        steps = np.diff(car.tracks["truth_time"][inside])
+        turns = np.diff(np.unwrap(car.tracks["truth_yaw"][inside])) - rate * steps
+        turned = float(np.ptp(np.cumsum(np.where(np.abs(turns) < SPIN * steps, turns, 0.0))))
         if turned > max(TURNED, SLOW * (end - begin)):
             text = f"the turn rate of {car.name} is {rate:.3g} rad/s in a row for {end - begin:.1f} s, in which "
             text += f"motion capture turns it by {math.degrees(turned):.0f} deg"

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from coopenv.cars.bags.clocks import CAMERAS
 from coopenv.cars.calibration.batch import misfits, seen_from
 from coopenv.cars.calibration.calibrate import INTRINSICS
+from coopenv.cars.calibration.drives import LEAST_SECONDS
 from coopenv.cars.doctor.finding import Change, Diagnosis, Finding, Treatment, with_error
 from coopenv.cars.doctor.streams import CarStreams, Planar
 from coopenv.cars.messages.vision import Calibration, rays
@@ -26,7 +27,8 @@ from coopenv.estimation.poses import Array
 FEWEST, MOST = 12, 300  # sightings
 BAD = 0.004
 """Mean misfit, of angles of 3.6 deg, above which a coarse cause is looked for; smaller ones are calibration's."""
-OFF_DEG = 3.6
+OFF_DEG, MOST_OFF = 3.6, 0.8
+"""Angle of a ray that is off, deg, and share of the rays to a landmark that is elsewhere."""
 REMOVED = 0.35
 """Share of the misfit that the cause leaves at most."""
 SMALL_DEG, SMALL_LOG, SMALL_M = 6.0, math.log(1.2), 0.3
@@ -60,6 +62,11 @@ class PosedSightings:
     def misfit(self) -> float:
         """Return the mean of (2 sin(angle / 2))^2 up to 0.04 between rays and markers."""
         return float(misfits(self.ray, self.ahead))
+
+    def is_bad(self) -> bool:
+        """Return whether a coarse cause is looked for: all rays misfit, or most of those to one landmark."""
+        counts, off = np.bincount(self.target), np.bincount(self.target, self.off_deg() > OFF_DEG)
+        return self.misfit() >= BAD or bool(((off > MOST_OFF * counts) & (counts >= FEWEST)).any())
 
 
 def thinned(car: CarStreams) -> CarStreams | None:
@@ -304,10 +311,13 @@ FAR = 10.0
 
 
 def of_sight(given: CarStreams) -> Iterator[Diagnosis]:
-    """Yield the causes, at most two, of a coarse misfit between bearings, map and motion capture."""
-    if (car := thinned(given)) is None or (sight := sight_of(car)).misfit() < BAD:
+    """Yield the causes, at most two, of a coarse misfit between bearings, map and motion capture.
+
+    A short drive has none: from one place many look alike.
+    """
+    if (car := thinned(given)) is None or not (sight := sight_of(car)).is_bad():
         return
-    topic, found, changed = car.topic([Role.TRUTH]), explanation(car), car
+    topic, found, changed = car.topic([Role.TRUTH]), explanation(car) if np.ptp(car.time) > LEAST_SECONDS else [], car
     for cause in found:
         changed = cause.change(changed)
     rest = f", and {sight_of(changed).off_share():.0%} with that mended" if found else ""
@@ -358,3 +368,13 @@ def _far(car: CarStreams, sight: PosedSightings) -> str:
     width = float(np.linalg.norm(np.ptp(flat, axis=0)))
     away = float(np.median(np.abs(sight.place[:, None] - (flat[:, 0] + 1j * flat[:, 1])).min(axis=1)))
     return f"{away:.3g} m from landmarks that span {width:.3g} m" if width and away > FAR * width else ""
+
+
+def exchanged_bodies(one: CarStreams, other: CarStreams) -> list[CarStreams]:
+    """Return two cars with each other's motion capture, if bearings of both misfit and fit with that; or none."""
+    names, given = ("truth_time", "truth", "truth_yaw"), [thinned(one), thinned(other)]
+    if not all(car is not None and sight_of(car).misfit() > BAD for car in given):
+        return []
+    right = [a.with_tracks(**{name: b.tracks[name] for name in names}) for a, b in ((one, other), (other, one))]
+    fitting = [thinned(car) for car in right]
+    return right if all(car is not None and sight_of(car).misfit() < BAD for car in fitting) else []

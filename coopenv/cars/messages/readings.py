@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -76,6 +77,10 @@ class Sample:
     value: Value
     stated: Stated = NOTHING  # beside the value, untested
 
+    def at(self, stamp: int, received: int) -> "Sample":
+        """Return the sample with other times."""
+        return Sample(self.car, self.role, stamp, received, self.value, self.stated)
+
 
 PLAIN = VisionSettings()
 """Tags of the usual family in frames of a global shutter."""
@@ -89,7 +94,7 @@ def vector(value: Any, field: str, most: float) -> Array:
 def numbers_of(values: Any, field: str, most: float) -> Array:
     """Return numbers as an array. Raises CoopenvError: one is not finite, or larger than `most`."""
     numbers = np.array(values, dtype=np.float64)
-    if not (np.abs(numbers) <= most).all():
+    if not all(abs(number) <= most for number in numbers.tolist()):
         raise CoopenvError(f"{field}: {shown(numbers.tolist())} is not finite, or beyond {most:g}")
     return numbers
 
@@ -100,7 +105,12 @@ ASYMMETRY = 1e-3
 
 def covariance_of(values: Any) -> Array | None:
     """Return a covariance (6, 6); None: it is not known. Zeros, -1, NaN, and what is no covariance mean that."""
-    matrix = np.array(values, dtype=np.float64).reshape(6, 6)
+    return _covariance(np.asarray(values, dtype=np.float64).tobytes())
+
+
+@lru_cache(maxsize=256)  # most messages of a topic have the same
+def _covariance(values: bytes) -> Array | None:
+    matrix = np.frombuffer(values).reshape(6, 6)
     diagonal = matrix.diagonal()
     if not (np.abs(matrix) <= 1e12).all() or not matrix.any() or (diagonal < 0.0).any():
         return None
@@ -297,7 +307,8 @@ def _turning(message: Any) -> Twist:
 
 def _pose_with_covariance(pose: Any) -> CarPose:
     """Return the pose of a PoseWithCovariance."""
-    return replace(placed(pose.pose), covariance=covariance_of(pose.covariance))
+    place = placed(pose.pose)
+    return CarPose(place.position, place.rotation, covariance_of(pose.covariance))
 
 
 def placed(pose: Any) -> CarPose:

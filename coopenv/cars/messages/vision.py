@@ -59,12 +59,21 @@ def rays(pixels: Array, calibration: Calibration) -> tuple[Array, NDArray[np.boo
     return through / np.linalg.norm(through, axis=-1, keepdims=True), inside & there
 
 
-@lru_cache(maxsize=2**17)
-def ray_of(calibration: Calibration, u: int, v: int) -> tuple[float, float, float] | None:
-    """Return the ray of a whole pixel, as `rays` does; None: it has none. There are few enough to remember them all."""
-    unit, there = rays(np.array([[u, v]], dtype=np.float64), calibration)
-    x, y, z = unit[0].tolist()
-    return (x, y, z) if there[0] else None
+TILE = 32  # pixels of the side of a square whose rays are computed together, which costs as much as one ray
+
+
+@lru_cache(maxsize=2**12)
+def _tile(calibration: Calibration, column: int, row: int) -> tuple[list[list[float]], list[bool]]:
+    v, u = np.indices((TILE, TILE)).reshape(2, -1)
+    units, there = rays(np.column_stack([u + TILE * column, v + TILE * row]).astype(np.float64), calibration)
+    return units.tolist(), there.tolist()
+
+
+def ray_of(calibration: Calibration, u: int, v: int) -> list[float] | None:
+    """Return the ray of a whole pixel, as `rays` does; None: it has none."""
+    (column, u), (row, v) = divmod(u, TILE), divmod(v, TILE)
+    units, there = _tile(calibration, column, row)
+    return units[TILE * v + u] if there[TILE * v + u] else None
 
 
 class Quality(NamedTuple):

@@ -49,6 +49,13 @@ class Correction(Section):
             raise ValueError(f"has {len(given)} coefficients, a model has 4, 5 or 8")
         return given
 
+    @field_validator("wheel_factor", "gyro_factor")
+    @classmethod
+    def _keeps_the_stream(cls, given: float) -> float:
+        if given == 0.0:
+            raise ValueError("is 0, which leaves nothing of the stream")
+        return given
+
     def lens(self, lens: "Calibration") -> "Calibration":
         """Return a camera's intrinsics with those that are given here."""
         names = ("focal_length", "principal_point", "distortion")
@@ -59,7 +66,7 @@ class Correction(Section):
         v, w = twist.linear, None if by_imu and role is Role.WHEEL else twist.angular
         linear = None if v is None else v * (self.wheel_factor / (1.0 + self.wheel_scale))
         angular = None if w is None else self.gyro_factor * w - (0.0, 0.0, self.gyro_bias)
-        return replace(twist, linear=linear, angular=angular)
+        return type(twist)(linear, angular, twist.pose)
 
 
 Lead = Annotated[float, Field(ge=-2.0, le=2.0)]

@@ -22,7 +22,7 @@ from coopenv.cars.doctor.finding import Diagnosis, Finding, Treatment, with_erro
 from coopenv.cars.doctor.live import StreamMonitor
 from coopenv.cars.doctor.motion import of_frozen_streams, velocity_relations
 from coopenv.cars.doctor.relation import relation
-from coopenv.cars.doctor.sight import thinned
+from coopenv.cars.doctor.sight import BAD, sight_of, thinned
 from coopenv.cars.doctor.streams import CarStreams, Streams
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist
 from coopenv.cars.messages.vision import Calibration
@@ -271,6 +271,38 @@ def test_a_window_of_live_samples_gives_the_same_line() -> None:
     assert re.search(FAULTS["gyro reversed"][1], str(found)) and not right.findings()
 
 
+def test_live_motion_capture_that_repeats_a_pose_is_refused() -> None:
+    streams = streams_of(FAULTS["truth stuck"][0])
+    monitor = StreamMonitor(streams.binding)
+    for sample in streams.samples:
+        monitor.put(sample)
+    [found] = monitor.findings()
+    assert "repeats one pose" in found.text and found.treatment is Treatment.REFUSED
+
+
+def test_live_samples_are_kept_for_seconds_whatever_their_rate() -> None:
+    """A fault of the first seconds is gone after 20 s, and a fault within them counts at a rate of 4 kHz, too."""
+    streams = streams_of(None)
+    monitor = StreamMonitor(streams.binding)
+    for sample in streams.samples:
+        for late in range(20 if sample.role is Role.IMU else 1):
+            monitor.put(replace(sample, stamp=sample.stamp + 500_000 * late))
+    kept = monitor._kept["car"]
+    assert 19.0 < 1e-9 * (kept[-1].received - kept[0].received) <= 20.0
+
+
+def test_a_clock_that_is_set_back_begins_anew() -> None:
+    """The wrong samples after it are found; those before it, of a later time, are forgotten."""
+    hour, wrong = 3600 * S, streams_of(FAULTS["gyro reversed"][0])
+    monitor = StreamMonitor(wrong.binding)
+    for sample in driven():
+        monitor.put(replace(sample, stamp=sample.stamp + hour, received=sample.received + hour))
+    assert not monitor.findings()
+    for sample in wrong.samples:
+        monitor.put(sample)
+    assert re.search(FAULTS["gyro reversed"][1], str(monitor.findings()[0]))
+
+
 @pytest.mark.parametrize(("factor", "scale"), [(1.0, 0.3), (-2.0, 1.0), (57.3, 0.1)])
 def test_a_relation_has_the_error_that_noise_gives_it(factor: float, scale: float) -> None:
     """Factors of 200 draws scatter by the standard error that is stated."""
@@ -304,6 +336,55 @@ def test_a_short_sound_drive_is_silent(seconds: float, seed: int) -> None:
         assert not examine(replace(whole, samples=cut(driven(seed), begin, seconds))).findings
 
 
+@pytest.mark.parametrize("begin", [0.0, 4.0, 8.0, 12.0, 16.0])
+def test_four_seconds_on_the_map_of_another_room_have_no_cause(begin: float) -> None:
+    other = streams_of(None, places=PLACES[[2, 3, 1, 4, 0]] * [0.8, 1.2, 1.0] + [0.3, -0.2, 0.0])
+    found = examine(replace(other, samples=cut(driven(), begin, 4.0))).findings
+    assert all(f.subject == "/car/truth" and "no single cause" in f.text for f in found)
+
+
+def test_motion_capture_of_two_cars_that_is_exchanged_is_named_for_both() -> None:
+    one, two = (streams_of(None, seed=seed).car("car") for seed in (0, 1))
+    two = replace(two, name="other", topics={role: f"/other/{role.value}" for role in two.topics})
+    names = ("truth_time", "truth", "truth_yaw")
+    assert not examine_cars([one, two]).findings
+    pairs = ((one, two), (two, one))
+    wrong = [a.with_tracks(**{name: b.tracks[name] for name in names}) for a, b in pairs]
+    found = examine_cars(wrong).findings
+    assert [f.subject for f in found] == ["/car/truth", "/other/truth"]
+    assert all("of car and other is exchanged" in f.text for f in found)
+
+
+@pytest.mark.parametrize("kind", ["linear", "angular"])
+def test_a_stream_with_noise_that_sticks_is_found_without_motion_capture(kind: str) -> None:
+    held: list[Any] = []
+
+    def change(value: Any, t: float) -> Any:
+        given = getattr(value, kind, None)
+        if given is None or not 8.0 < t < 12.0:
+            return value
+        held.append(given)
+        return replace(value, **{kind: held[0]})
+
+    [found] = examine(streams_of(change, truth=False)).findings
+    assert re.search(r"in a row for 4\.\d s, and has noise", found.text) and found.treatment is Treatment.REFUSED
+
+
+def test_a_landmark_elsewhere_is_named_where_few_bearings_are_to_it() -> None:
+    """The mean over all bearings is below what counts as bad."""
+    car = streams_of(None).car("car")
+    rows = np.flatnonzero(car.target != 1)
+    rows = np.sort(np.append(rows, np.flatnonzero(car.target == 1)[::2]))
+    car = replace(car, time=car.time[rows], target=car.target[rows], ray=car.ray[rows])
+    places = car.places.copy()
+    places[1, 0] += 1.5
+    wrong = replace(car, places=places)
+    thin = thinned(wrong)
+    assert thin is not None and sight_of(thin).misfit() < BAD
+    [found] = examine_cars([wrong]).findings
+    assert "landmark SL2 stands at" in found.text
+
+
 def test_the_scale_of_wheels_is_that_of_the_arc_in_tight_turns() -> None:
     """A chord is shorter than its arc: by 1/24 of the square of the turn within a second."""
     t = np.arange(0.0, 40.0, 0.02)
@@ -317,6 +398,17 @@ def test_the_scale_of_wheels_is_that_of_the_arc_in_tight_turns() -> None:
     path = SampledSignal(t, np.column_stack([place.real, place.imag])), SampledSignal(t, yaw)
     body, _ = velocity_relations(car, *path)
     assert body is not None and abs(body.factor - 1.2) < max(0.002, 3.0 * body.error)
+
+
+def test_a_heading_of_motion_capture_that_jumps_contradicts_no_turn_rate() -> None:
+    """A body whose markers are mistaken for 1.6 s, of a car that drives straight on with a turn rate of 0."""
+    t = np.arange(0.0, 20.0, 0.05)
+    tracks = {"truth_time": t, "truth": 0.3 * t + 0j, "truth_yaw": np.where((t > 8.0) & (t < 9.6), 0.4, 0.0)}
+    tracks |= {"wheel_time": t, "wheel": 0.3 + 0.01 * np.random.default_rng(0).normal(size=len(t)) + 0j}
+    car: Any = SimpleNamespace(
+        name="car", tracks=tracks | {"gyro_time": t, "gyro": 0.0 * t}, topic=lambda roles: "/imu"
+    )
+    assert not [*of_frozen_streams(car)]
 
 
 def test_a_velocity_that_sticks_after_a_stand_is_found() -> None:
