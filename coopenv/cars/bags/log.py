@@ -279,7 +279,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     fixed = {track.chosen.topic for track in tracks if track.source in stated}
     behind = {track.chosen.topic: seconds for track in tracks if (seconds := track.behind(clocks)) is not None}
     moves = moves_of(leads, chosen, tolerance / NS, fixed, behind)
-    samples = samples_of(tracks, clocks, moves) if examined.mends or moves else streams.samples
+    samples = samples_of(tracks, clocks, moves) if examined.mends or moves else tuple(streams.samples)
     for entry in chosen:
         if entry.topic in moves and entry.car in examined.cars:
             own = examined.cars[entry.car]

@@ -253,8 +253,8 @@ def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]
 def row_of(batch: Batch, n: int, x: Array, error: Array, finding: str = "") -> ConstantRow:
     """Return the row of a constant by deviations and standard errors (G,) of all."""
     kind, factor = batch.kinds[n], np.degrees(1.0) if batch.kinds[n].unit == "deg" else 1.0
-    values = (factor * float(v) for v in (batch.base[n], batch.base[n] + x[n], error[n]))
-    return ConstantRow(kind.name, kind.unit, *values, finding)
+    given, value, std = (factor * float(v) for v in (batch.base[n], batch.base[n] + x[n], error[n]))
+    return ConstantRow(kind.name, kind.unit, given, value, std, finding)
 
 
 def unexplained(batch: Batch, fit: Fit) -> Iterator[str]:

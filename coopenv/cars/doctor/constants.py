@@ -105,13 +105,13 @@ def _windows(drive: CalibrationDrive) -> float:
 
 def _changes(drive: CalibrationDrive, car: CarDrive) -> Iterator[tuple[str, CarDrive, np.ndarray]]:
     """Yield causes, and the streams and the map without them."""
-    places, lens = drive.places, car.lens
+    places = drive.places
     for what, factor in SPEED_FACTORS.items():
         text = f"the velocity of {car.name} is {factor:.4g} times that by bearings ({what})"
         yield text, replace(car, wheel=car.wheel / factor), places
     for what, signs in (("image is mirrored", [-1.0, 1.0, 1.0]), ("image is upside down", [-1.0, -1.0, 1.0])):
         yield f"its {what}", replace(car, ray=car.ray * signs), places
-    for factor in (0.5, 2.0) if lens is not None else ():
+    for factor, lens in ((factor, car.lens) for factor in (0.5, 2.0) if car.lens is not None):
         fx, fy, cx, cy = (factor * value for value in (*lens.focal_length, *lens.principal_point))
         right = replace(lens, focal_length=(fx, fy), principal_point=(cx, cy), image_size=(100_000, 100_000))
         ray, there = rays(car.pixel, right)
