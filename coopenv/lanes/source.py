@@ -19,7 +19,9 @@ class CannotLaneError(Exception):
 
 VARIABLE = re.compile(r"\bvar_\w+\b")
 _WORD = re.compile(r"\w+")
-_FUNCTION = re.compile(r"^static ([^\n(]+?) (\w+)\(\n((?:    [^\n]*\n?)*?)\)\n\{\n(.*?)^\}\n", re.M | re.S)
+_FUNCTION = re.compile(
+    r"^static (?:WP_NOINLINE )?([^\n(]+?) (\w+)\(\n((?:    [^\n]*\n?)*?)\)\n\{\n(.*?)^\}\n", re.M | re.S
+)
 _RECORD = re.compile(r"^struct (\w+)\n\{\n((?:    [^\n]+;\n)+)", re.M)
 _DECLARATION = re.compile(r"    (const )?(.+?) ?(var_\w+)( = (.*))?;$")
 _ARGUMENT = re.compile(r"\s*(.*?)\s*((?:var|ret)_\w+)$", re.M)

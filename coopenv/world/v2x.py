@@ -30,7 +30,7 @@ from coopenv.world.random import (
     signed_uniform,
     uniform,
 )
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, outlined
 
 NEVER = wp.constant(-1)
 NOTHING = wp.constant(0)
@@ -43,6 +43,7 @@ MOST_CLOCK_TICKS = wp.constant(1.0e8)
 
 
 @wp.func
+@outlined
 def draw_faults(model: Any, state: Any, world: int, vehicle: int):
     """Draw the faults of a vehicle in an episode."""
     o = type(state.broadcast_shift[world, vehicle])()
@@ -154,6 +155,7 @@ def is_lying(state: Any, world: int, vehicle: int, tick: int) -> bool:
 
 
 @wp.func
+@outlined
 def alter(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Decide the difference between a vehicle's broadcast pose and its estimate at a tick."""
     if model.alters == 0:
@@ -274,6 +276,7 @@ def start_covariance(model: Any, state: Any, world: int, vehicle: int):
 
 
 @device_function
+@outlined
 def broadcast(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Broadcast a vehicle's estimate (Rhat, Rhat phat), and when it last measured each vehicle.
 
@@ -351,6 +354,7 @@ def put_into_inbox(model: Any, state: Any, world: int, receiver: int, box: int, 
 
 
 @device_function
+@outlined
 def transmit(model: Any, state: Any, world: int, receiver: int, tick: int):
     """Decide which messages arrive at a receiver at a tick, by the scenario's radio: write when they were sent, or -1.
 
@@ -412,6 +416,7 @@ def is_lost(model: Any, state: Any, world: int, receiver: int, sender: int, tick
 
 
 @device_function
+@outlined
 def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
     """Receive the messages arriving at this tick, and decide the claims of the own message."""
     alter(model, state, world, receiver, tick)
