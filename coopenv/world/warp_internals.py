@@ -194,7 +194,8 @@ _generate_module: Any = context.ModuleBuilder.codegen
 def _module_source(builder: Any, device: str) -> str:
     """Return the source of a module; one with the option `in_lanes` takes several worlds at once on the CPU.
 
-    Derivatives of records, which no function uses, would be compiled. Warp compiles a kernel of a CPU twice, once for arrays without gaps: here the other one serves all arrays.
+    Derivatives of records, which no function uses, would be compiled. Warp compiles a kernel of a CPU twice, once for
+    arrays without gaps: here the other version serves all arrays.
     """
     source: str = _generate_module(builder, device)
     ours = device == "cpu" and builder.module.name.startswith("coopenv.")
