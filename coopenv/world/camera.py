@@ -333,7 +333,6 @@ def expose(model: Any, state: Any, world: int, vehicle: int, tick: int):
     return camera.latency + state.camera_delay[world, vehicle] + camera.latency_jitter * jitter
 
 
-@device_function
 @outlined
 def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Take one camera frame of one vehicle; the truth of this tick and the grid are already in place.

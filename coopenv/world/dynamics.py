@@ -16,7 +16,6 @@ from coopenv.world.route import UNDER_WAY
 from coopenv.world.warp_internals import device_function, outlined
 
 
-@device_function
 @outlined
 def decide(model: Any, state: Any, actions: Any, world: int):
     """Turn the actions of a decision into commands; a vehicle whose episode has ended stops."""
@@ -148,7 +147,6 @@ def turn_camera(model: Any, state: Any, world: int, vehicle: int, command: Any):
         state.pan[world, vehicle] = pan + wp.clamp(wanted - pan, -step, step)
 
 
-@device_function
 @outlined
 def move(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Carry the truth of a vehicle to the tick's end."""
@@ -161,7 +159,6 @@ def move(model: Any, state: Any, world: int, vehicle: int, tick: int):
         turn_camera(model, state, world, vehicle, command)
 
 
-@device_function
 @outlined
 def remember(model: Any, state: Any, world: int, tick: int):
     """Keep the poses and twists of all agents at a tick, in worlds where some camera's frames have an age."""

@@ -174,7 +174,6 @@ HOST = Embedded("host", estimate_nothing, start_nothing, send_nothing)
 """Placeholder for an observer that runs on the host (`coopenv.api.host_observers.PlugIns`)."""
 
 
-@device_function
 @outlined
 def sense_vehicle(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Run the sensing stages of a vehicle, at the start of an episode (tick 0) as at every tick."""
@@ -198,7 +197,6 @@ def begin_sensing(model: Any, state: Any, world: int):
         sense_vehicle(model, state, world, vehicle, 0)
 
 
-@device_function
 @outlined
 def begin_simulation(model: Any, state: Any, record: Any, world: int):
     """Draw the start of an episode, and take the first frame."""

@@ -100,7 +100,6 @@ def clear_cells(model: Any, state: Any, world: int):
     state.body_reach[world] = reach
 
 
-@device_function
 @outlined
 def sort_into_cells(model: Any, state: Any, world: int):
     """Fill the grid of a world with the present positions."""

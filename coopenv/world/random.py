@@ -55,7 +55,6 @@ STREAMS_PER_SENSOR = wp.constant(wp.uint32(16))
 """Streams of sensors beside the camera: the first, and how many each one has, see `coopenv.world.sensors`."""
 
 
-@wp.func
 @outlined
 def philox(counter: vec4u, key0: wp.uint32, key1: wp.uint32) -> vec4u:
     """Return four independent 32-bit words for a 128-bit counter and a 64-bit key."""

@@ -62,7 +62,6 @@ def touches_building_of(model: Any, cell: int, center: Any, R: Any, half: Any) -
     return False
 
 
-@device_function
 @outlined
 def touches_anything(model: Any, state: Any, world: int, vehicle: int) -> int:
     """Return 1 when a vehicle's box overlaps a building or another body."""
@@ -130,7 +129,6 @@ def depart(model: Any, state: Any, world: int, vehicle: int):
         state.present[world, model.landmarks + vehicle] = 0
 
 
-@device_function
 @outlined
 def referee(model: Any, state: Any, world: int, vehicle: int):
     """Mark contact, and end the vehicle's episode on a collision or an arrival that counts; or give it a new route."""

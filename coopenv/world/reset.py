@@ -134,7 +134,6 @@ def draw_place(model: Any, state: Any, world: int, landmark: int):
     return d.area_corner[area] + along + type(second)(zero, zero, height * uniform(words[2], one))
 
 
-@wp.func
 @outlined
 def place_at(model: Any, state: Any, world: int, agent: int, position: Any, R: Any, attempt: int):
     """Draw the true start pose of one agent about a given one and start its motion."""
@@ -164,7 +163,6 @@ def place_at(model: Any, state: Any, world: int, agent: int, position: Any, R: A
         prescribe(model, state, world, agent, wp.float64(0.0))
 
 
-@wp.func
 @outlined
 def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
     """Reset the vehicle's actuators, odometry and counters."""
@@ -246,7 +244,6 @@ def random_turn(largest: Any, words: Any, zero: Any):
     return axis * ((low + high) * zero.dtype(0.5))
 
 
-@wp.func
 @outlined
 def set_initial_estimate(model: Any, state: Any, world: int, vehicle: int):
     """Draw the initial estimate and set P(0)."""
@@ -278,7 +275,6 @@ def set_initial_estimate(model: Any, state: Any, world: int, vehicle: int):
     state.coordinates[world, vehicle] = model.coordinates
 
 
-@wp.func
 @outlined
 def place_bodies(model: Any, state: Any, world: int):
     """Begin at tick 0: draw the world's random quantities and place all bodies."""

@@ -299,7 +299,6 @@ def following_acceleration(speed: Any, wanted: Any, gap: Any, ahead: Any):
     return type(speed)(ACCELERATION) * (one - free * free * free * free - share * share)
 
 
-@device_function
 @outlined
 def bend_speed(state: Any, world: int, vehicle: int, s: Any, top: Any):
     """Return the speed (m/s) from which a vehicle at arc length `s` can slow down for the bends of its route."""
@@ -316,7 +315,6 @@ def bend_speed(state: Any, world: int, vehicle: int, s: Any, top: Any):
     return wp.sqrt(square)
 
 
-@device_function
 @outlined
 def gap_ahead(model: Any, state: Any, world: int, vehicle: int, s: Any, front: Any):
     """Return the gap (m) to the nearest body in a vehicle's way, and its speed along the route (m/s).
@@ -373,7 +371,6 @@ def gap_to_signal(model: Any, state: Any, world: int, vehicle: int, s: Any, tick
     return type(s)(1.0e6)
 
 
-@device_function
 @outlined
 def direct_traffic(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Write the command that a vehicle of the traffic follows until the next tick, from the poses of this one."""

@@ -81,6 +81,11 @@ CUDA_CALLABLE inline T& element(const wp::array_t<T>& array, Indices... indices)
 codegen.cpu_module_header += ELEMENT
 
 
+def _is_ours(function: Callable[..., Any], device: str, options: Mapping[str, Any]) -> bool:
+    """Return whether a function is of this package, for a CPU and without derivatives."""
+    return device == "cpu" and function.__module__.startswith("coopenv.") and not options["enable_backward"]
+
+
 def _as_in_c(source: str, function: Callable[..., Any], device: str, options: Mapping[str, Any]) -> str:
     """Return the source of a function of this package with indices and loops of C: a sixth less time.
 
@@ -89,8 +94,7 @@ def _as_in_c(source: str, function: Callable[..., Any], device: str, options: Ma
     need not be read again after every write to an array (`__restrict__`). Debug builds (`wp.config.mode`) check
     indices, and stay as they are; so does CUDA, where more values would be spilled (`make cuda-check`).
     """
-    ours = device == "cpu" and str(function.__module__).startswith("coopenv.")
-    if not ours or options["enable_backward"] or wp.config.mode == "debug":
+    if not _is_ours(function, device, options) or wp.config.mode == "debug":
         return source
     source = re.sub(r"wp::array_store\((.*), (\w+)\);", r"coopenv::element(\1) = \2;", source)
     source = source.replace("wp::address(", "&coopenv::element(").replace("wp::index(", "coopenv::element(")
@@ -108,7 +112,7 @@ def _function_source(adj: Any, *arguments: Any, **given: Any) -> str:
     Derivatives that nothing differentiates are left out, and `outlined` functions are not inlined.
     """
     options, device = given["options"], given["device"]
-    if device != "cpu" or options["enable_backward"] or not str(adj.func.__module__).startswith("coopenv."):
+    if not _is_ours(adj.func, device, options):
         return str(_generate_function(adj, *arguments, **given))
     if given.get("reverse_only"):
         return ""
@@ -160,10 +164,7 @@ def lanes_guest() -> Any:
     return None if point is None else loaded(point, "lanes")
 
 
-_DERIVATIVES = re.compile(
-    r"^(?:static )?CUDA_CALLABLE (?:void adj_\w+|\w+ add)\([^{}]*?\)\n\{\n.*?^\}\n", re.MULTILINE | re.DOTALL
-)
-"""Derivatives of records, and their sums."""
+_DERIVATIVES = re.compile(r"^(?:static )?CUDA_CALLABLE (?:void adj_\w+|\w+ add)\([^{}]*?\)\n\{\n.*?^\}\n", re.M | re.S)
 _BODY = re.compile(r"\n\{\n.*?\n\}\n", re.S)
 _VARIABLE = re.compile(r"\bvar_\w+")
 _LOAD = re.compile(r"^ *(var_\w+) = wp::load\((var_\w+)\);\n", re.M)
@@ -204,9 +205,8 @@ def _module_source(builder: Any, device: str) -> str:
     if wanted := builder.options.get("in_lanes"):
         source = lanes_guest().in_lanes(source, wanted)
     records = [record.native_name for record in builder.structs if _has_arrays(record)]
-    return _in_place(_DERIVATIVES.sub("", source), records).replace(
-        "_cpu_forward_tasks<true>(", "_cpu_forward_tasks<false>("
-    )
+    source = _in_place(_DERIVATIVES.sub("", source), records)
+    return source.replace("_cpu_forward_tasks<true>(", "_cpu_forward_tasks<false>(")
 
 
 context.ModuleBuilder.codegen = _module_source  # type: ignore[method-assign]
@@ -215,16 +215,6 @@ context.ModuleBuilder.codegen = _module_source  # type: ignore[method-assign]
 def host_only(function: Callable[..., Any]) -> Callable[..., Any]:
     """Leave the kernel of a function out of the modules of CUDA devices."""
     function.host_only = True  # type: ignore[attr-defined]
-    return function
-
-
-def outlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Keep the compiler of a CPU from inlining a function, below the decorator of Warp or `device_function`.
-
-    For stages of a tick and large functions with several callers, which are then compiled once: a sixth of the time of
-    the first step. Functions that return matrices or run for every pair of agents would be slower.
-    """
-    function.outlined = True  # type: ignore[attr-defined]
     return function
 
 
@@ -242,6 +232,16 @@ def device_function(function: Callable[..., Any]) -> Any:
     made = wp.func(function)
     made.__class__ = _ByReference
     return made
+
+
+def outlined(function: Callable[..., Any]) -> Any:
+    """Return a `device_function` that the compiler of a CPU does not inline.
+
+    For stages of a tick and large functions with several callers, which are then compiled once: a sixth of the time of
+    the first step. Functions that return matrices or run for every pair of agents would be slower.
+    """
+    function.outlined = True  # type: ignore[attr-defined]
+    return device_function(function)
 
 
 def subroutine(function: Callable[..., Any]) -> Any:
