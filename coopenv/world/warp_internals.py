@@ -83,7 +83,7 @@ codegen.cpu_module_header += ELEMENT
 
 def _is_ours(function: Callable[..., Any], device: str, options: Mapping[str, Any]) -> bool:
     """Return whether a function is of this package, for a CPU and without derivatives."""
-    return device == "cpu" and function.__module__.startswith("coopenv.") and not options["enable_backward"]
+    return device == "cpu" and str(function.__module__).startswith("coopenv.") and not options["enable_backward"]
 
 
 def _as_in_c(source: str, function: Callable[..., Any], device: str, options: Mapping[str, Any]) -> str:
