@@ -19,12 +19,17 @@ import ctypes
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
+from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 import warp as wp
 from warp._src import codegen, context
 
 from coopenv.base.plugins import loaded, own
+
+SOURCE_RULES = sha256(Path(__file__).read_bytes()).hexdigest()[:16]
+"""Of this file: an option of every module, as what Warp compiles is not its own text, of which it knows the hash."""
 
 
 def cpu_features() -> frozenset[str]:
