@@ -19,7 +19,9 @@ class CannotLaneError(Exception):
 
 VARIABLE = re.compile(r"\bvar_\w+\b")
 _WORD = re.compile(r"\w+")
-_FUNCTION = re.compile(r"^static ([^\n(]+?) (\w+)\(\n((?:    [^\n]*\n?)*?)\)\n\{\n(.*?)^\}\n", re.M | re.S)
+_FUNCTION = re.compile(
+    r"^static (?:WP_NOINLINE )?([^\n(]+?) (\w+)\(\n((?:    [^\n]*\n?)*?)\)\n\{\n(.*?)^\}\n", re.M | re.S
+)
 _RECORD = re.compile(r"^struct (\w+)\n\{\n((?:    [^\n]+;\n)+)", re.M)
 _DECLARATION = re.compile(r"    (const )?(.+?) ?(var_\w+)( = (.*))?;$")
 _ARGUMENT = re.compile(r"\s*(.*?)\s*((?:var|ret)_\w+)$", re.M)
@@ -96,9 +98,12 @@ class GeneratedSource:
     text: str
     functions: dict[str, list[Function]] = field(default_factory=dict)
     records: dict[str, list[tuple[str, str]]] = field(default_factory=dict)
+    outlined: set[str] = field(default_factory=set)
+    """Names of functions that the compiler does not inline."""
 
     def __post_init__(self) -> None:
         """Read the text."""
+        self.outlined.update(re.findall(r"^static WP_NOINLINE [^\n(]+ (\w+)\(", self.text, re.M))
         for returns, name, arguments, body in _FUNCTION.findall(self.text):
             if _FORWARD in body and not name.startswith("adj_") and not name.endswith("_kernel_forward"):
                 given = _ARGUMENT.findall(arguments.replace(",\n", "\n"))

@@ -411,4 +411,5 @@ class Version:
                 arguments.append(f"{self.laned(kind.rstrip('& '))}& {argument}")
             else:
                 arguments.append(f"{kind if argument.startswith('ret_') else self.kind(argument)} {argument}")
-        return f"static {self.return_kind} {self.name}({', '.join(arguments)})\n{{\n{self.body()}}}\n"
+        hint = "WP_NOINLINE " if self.function.name in self.module.source.outlined else ""
+        return f"static {hint}{self.return_kind} {self.name}({', '.join(arguments)})\n{{\n{self.body()}}}\n"

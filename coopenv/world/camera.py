@@ -41,7 +41,7 @@ from coopenv.world.random import (
     signed_uniform,
     uniform,
 )
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, outlined
 
 VISIBLE = wp.constant(wp.uint8(Sight.VISIBLE))
 OUT_OF_VIEW = wp.constant(wp.uint8(Sight.OUT_OF_VIEW))
@@ -333,7 +333,7 @@ def expose(model: Any, state: Any, world: int, vehicle: int, tick: int):
     return camera.latency + state.camera_delay[world, vehicle] + camera.latency_jitter * jitter
 
 
-@device_function
+@outlined
 def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Take one camera frame of one vehicle; the truth of this tick and the grid are already in place.
 

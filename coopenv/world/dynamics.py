@@ -13,10 +13,10 @@ from coopenv.motions.command import ACCELERATION, LATERAL, PAN, SPEED, command_o
 from coopenv.motions.dispatch import displacement, drive_step
 from coopenv.world.model import DRIVEN, PRESCRIBED
 from coopenv.world.route import UNDER_WAY
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, outlined
 
 
-@device_function
+@outlined
 def decide(model: Any, state: Any, actions: Any, world: int):
     """Turn the actions of a decision into commands; a vehicle whose episode has ended stops."""
     for vehicle in range(model.vehicles):
@@ -147,7 +147,7 @@ def turn_camera(model: Any, state: Any, world: int, vehicle: int, command: Any):
         state.pan[world, vehicle] = pan + wp.clamp(wanted - pan, -step, step)
 
 
-@device_function
+@outlined
 def move(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Carry the truth of a vehicle to the tick's end."""
     agent = model.landmarks + vehicle
@@ -159,7 +159,7 @@ def move(model: Any, state: Any, world: int, vehicle: int, tick: int):
         turn_camera(model, state, world, vehicle, command)
 
 
-@device_function
+@outlined
 def remember(model: Any, state: Any, world: int, tick: int):
     """Keep the poses and twists of all agents at a tick, in worlds where some camera's frames have an age."""
     for slot in range(model.past):

@@ -22,7 +22,7 @@ from coopenv.world.referee import depart, referee, touches_anything
 from coopenv.world.reset import place_bodies, set_initial_estimate
 from coopenv.world.route import appear, direct_traffic
 from coopenv.world.v2x import draw_faults, transmit
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, outlined
 
 
 @wp.struct
@@ -174,7 +174,7 @@ HOST = Embedded("host", estimate_nothing, start_nothing, send_nothing)
 """Placeholder for an observer that runs on the host (`coopenv.api.host_observers.PlugIns`)."""
 
 
-@device_function
+@outlined
 def sense_vehicle(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Run the sensing stages of a vehicle, at the start of an episode (tick 0) as at every tick."""
     observe(model, state, world, vehicle, tick)
@@ -197,7 +197,7 @@ def begin_sensing(model: Any, state: Any, world: int):
         sense_vehicle(model, state, world, vehicle, 0)
 
 
-@device_function
+@outlined
 def begin_simulation(model: Any, state: Any, record: Any, world: int):
     """Draw the start of an episode, and take the first frame."""
     place_bodies(model, state, world)

@@ -27,7 +27,7 @@ import warp as wp
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.files import lock, muted_errors
 from coopenv.base.installation import available_cores
-from coopenv.world.warp_internals import cpu_features, field_types, lanes_guest, replay_of
+from coopenv.world.warp_internals import SOURCE_RULES, cpu_features, field_types, lanes_guest, replay_of
 
 ATTEMPTS = 3
 """Attempts to load a module: the second rebuilds it, the third is for two processes that rebuild the same one."""
@@ -196,15 +196,15 @@ def compiler_options() -> dict[str, Any]:
     The same for all modules, because Warp's headers are parsed once for each set of flags. LLVM keeps its own depth of
     vectorisation: Warp's smaller one slows large observers down.
     """
-    flags = (wp.config.cpu_compiler_flags or "").split()
+    flags, rules = (wp.config.cpu_compiler_flags or "").split(), {"source_rules": SOURCE_RULES}
     if not any("-inline-threshold" in flag for flag in flags):
-        return {}
+        return rules
     start_warp()
     kept = [flag for flag in flags if not flag.startswith("-mllvm")]
     if "-march=native" in kept and cpu_features() >= X86_64_V3:
         kept = [*(flag for flag in kept if flag != "-march=native"), "-target-cpu", "x86-64-v3"]
     threshold = f"-mllvm=-inline-threshold={INLINE_THRESHOLD}"
-    return {"cpu_compiler_flags": " ".join([*kept, threshold])}
+    return {**rules, "cpu_compiler_flags": " ".join([*kept, threshold])}
 
 
 MOST_THREADS = 1024

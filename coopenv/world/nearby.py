@@ -20,7 +20,7 @@ import warp as wp
 from coopenv.estimation import Sight
 from coopenv.estimation.linalg import identity3
 from coopenv.world.random import CAMERA_RANGE
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, outlined
 
 FAR = wp.constant(1.0e8)
 """Largest cell number that fits into an integer."""
@@ -100,7 +100,7 @@ def clear_cells(model: Any, state: Any, world: int):
     state.body_reach[world] = reach
 
 
-@device_function
+@outlined
 def sort_into_cells(model: Any, state: Any, world: int):
     """Fill the grid of a world with the present positions."""
     if model.cells.across > 1:

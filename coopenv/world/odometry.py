@@ -33,13 +33,13 @@ from coopenv.world.random import (
     six_gaussians,
     uniform,
 )
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, outlined
 
 SHORTEST = wp.constant(-0.9)
 """Least error of a focal length, relative: a lens stays a lens."""
 
 
-@device_function
+@outlined
 def draw_errors(model: Any, state: Any, world: int, vehicle: int):
     """Draw the errors of a vehicle's sensors for an episode; no wheel slips yet."""
     noise = model.noise[vehicle]
@@ -136,7 +136,7 @@ def true_twist(model: Any, state: Any, world: int, vehicle: int, taken: int, t: 
     return model.motion.linear[segment] * pace, model.motion.angular[segment] * pace
 
 
-@device_function
+@outlined
 def measure_odometry(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Take the odometry samples of one camera tick after its motion and sum them to its increment."""
     drift(model, state, world, vehicle, tick)

@@ -12,6 +12,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.scenario.difficulty import PARAMETERS
+from coopenv.world.warp_internals import outlined
 
 vec4u = wp.types.vector(4, wp.uint32)
 
@@ -54,7 +55,7 @@ STREAMS_PER_SENSOR = wp.constant(wp.uint32(16))
 """Streams of sensors beside the camera: the first, and how many each one has, see `coopenv.world.sensors`."""
 
 
-@wp.func
+@outlined
 def philox(counter: vec4u, key0: wp.uint32, key1: wp.uint32) -> vec4u:
     """Return four independent 32-bit words for a 128-bit counter and a 64-bit key."""
     c = counter

@@ -19,7 +19,7 @@ from coopenv.world.route import (
     place_on_route,
     route_length,
 )
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, outlined
 
 ARRIVED = wp.constant(int(Outcome.ARRIVED))
 COLLIDED = wp.constant(int(Outcome.COLLIDED))
@@ -62,7 +62,7 @@ def touches_building_of(model: Any, cell: int, center: Any, R: Any, half: Any) -
     return False
 
 
-@device_function
+@outlined
 def touches_anything(model: Any, state: Any, world: int, vehicle: int) -> int:
     """Return 1 when a vehicle's box overlaps a building or another body."""
     return touches_one_of(model, state, world, vehicle, model.agents)
@@ -129,7 +129,7 @@ def depart(model: Any, state: Any, world: int, vehicle: int):
         state.present[world, model.landmarks + vehicle] = 0
 
 
-@device_function
+@outlined
 def referee(model: Any, state: Any, world: int, vehicle: int):
     """Mark contact, and end the vehicle's episode on a collision or an arrival that counts; or give it a new route."""
     touching = touches_anything(model, state, world, vehicle)

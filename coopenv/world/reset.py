@@ -33,6 +33,7 @@ from coopenv.world.random import (
 from coopenv.world.referee import touches_one_of
 from coopenv.world.route import draw_route, go_straight, has_routes, start_on_route
 from coopenv.world.v2x import NOTHING, POSE_BYTES, first_tick_of
+from coopenv.world.warp_internals import outlined
 
 ABSENT = wp.constant(-1)
 """Value of `ended` of a vehicle that is absent in this episode."""
@@ -133,7 +134,7 @@ def draw_place(model: Any, state: Any, world: int, landmark: int):
     return d.area_corner[area] + along + type(second)(zero, zero, height * uniform(words[2], one))
 
 
-@wp.func
+@outlined
 def place_at(model: Any, state: Any, world: int, agent: int, position: Any, R: Any, attempt: int):
     """Draw the true start pose of one agent about a given one and start its motion."""
     spread = model.start.position_spread[agent]
@@ -162,7 +163,7 @@ def place_at(model: Any, state: Any, world: int, agent: int, position: Any, R: A
         prescribe(model, state, world, agent, wp.float64(0.0))
 
 
-@wp.func
+@outlined
 def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
     """Reset the vehicle's actuators, odometry and counters."""
     agent = model.landmarks + vehicle
@@ -243,7 +244,7 @@ def random_turn(largest: Any, words: Any, zero: Any):
     return axis * ((low + high) * zero.dtype(0.5))
 
 
-@wp.func
+@outlined
 def set_initial_estimate(model: Any, state: Any, world: int, vehicle: int):
     """Draw the initial estimate and set P(0)."""
     agent = model.landmarks + vehicle
@@ -274,7 +275,7 @@ def set_initial_estimate(model: Any, state: Any, world: int, vehicle: int):
     state.coordinates[world, vehicle] = model.coordinates
 
 
-@wp.func
+@outlined
 def place_bodies(model: Any, state: Any, world: int):
     """Begin at tick 0: draw the world's random quantities and place all bodies."""
     state.tick[world] = 0

@@ -18,7 +18,7 @@ from coopenv.estimation import Outcome
 from coopenv.estimation.linalg import exp_so3
 from coopenv.world.nearby import body_of, cell_at, first_in, has_body, last_of_all, next_in, window_about
 from coopenv.world.random import NEXT_ROUTE, ROUTE, ROUTE_SHAPE, WANDER, on_cells, random_words, signed_uniform, uniform
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, outlined
 
 UNDER_WAY = wp.constant(int(Outcome.UNDER_WAY))
 
@@ -299,7 +299,7 @@ def following_acceleration(speed: Any, wanted: Any, gap: Any, ahead: Any):
     return type(speed)(ACCELERATION) * (one - free * free * free * free - share * share)
 
 
-@device_function
+@outlined
 def bend_speed(state: Any, world: int, vehicle: int, s: Any, top: Any):
     """Return the speed (m/s) from which a vehicle at arc length `s` can slow down for the bends of its route."""
     step = type(s)(3.0)
@@ -315,7 +315,7 @@ def bend_speed(state: Any, world: int, vehicle: int, s: Any, top: Any):
     return wp.sqrt(square)
 
 
-@device_function
+@outlined
 def gap_ahead(model: Any, state: Any, world: int, vehicle: int, s: Any, front: Any):
     """Return the gap (m) to the nearest body in a vehicle's way, and its speed along the route (m/s).
 
@@ -371,7 +371,7 @@ def gap_to_signal(model: Any, state: Any, world: int, vehicle: int, s: Any, tick
     return type(s)(1.0e6)
 
 
-@device_function
+@outlined
 def direct_traffic(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Write the command that a vehicle of the traffic follows until the next tick, from the poses of this one."""
     limits = model.dynamics[vehicle]

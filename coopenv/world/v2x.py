@@ -30,7 +30,7 @@ from coopenv.world.random import (
     signed_uniform,
     uniform,
 )
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, outlined
 
 NEVER = wp.constant(-1)
 NOTHING = wp.constant(0)
@@ -42,7 +42,7 @@ POSE_BYTES = wp.constant(56)
 MOST_CLOCK_TICKS = wp.constant(1.0e8)
 
 
-@wp.func
+@outlined
 def draw_faults(model: Any, state: Any, world: int, vehicle: int):
     """Draw the faults of a vehicle in an episode."""
     o = type(state.broadcast_shift[world, vehicle])()
@@ -153,7 +153,7 @@ def is_lying(state: Any, world: int, vehicle: int, tick: int) -> bool:
     return state.lie_tick[world, vehicle] >= 0 and tick >= state.lie_tick[world, vehicle]
 
 
-@wp.func
+@outlined
 def alter(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Decide the difference between a vehicle's broadcast pose and its estimate at a tick."""
     if model.alters == 0:
@@ -273,7 +273,7 @@ def start_covariance(model: Any, state: Any, world: int, vehicle: int):
     return model.start.covariance[row]
 
 
-@device_function
+@outlined
 def broadcast(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Broadcast a vehicle's estimate (Rhat, Rhat phat), and when it last measured each vehicle.
 
@@ -350,7 +350,7 @@ def put_into_inbox(model: Any, state: Any, world: int, receiver: int, box: int, 
         state.inbox_seen[world, receiver, box] = wp.where(seen < 0, -1, wp.max(seen + stamped - made, 0))
 
 
-@device_function
+@outlined
 def transmit(model: Any, state: Any, world: int, receiver: int, tick: int):
     """Decide which messages arrive at a receiver at a tick, by the scenario's radio: write when they were sent, or -1.
 
@@ -411,7 +411,7 @@ def is_lost(model: Any, state: Any, world: int, receiver: int, sender: int, tick
     return False
 
 
-@device_function
+@outlined
 def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
     """Receive the messages arriving at this tick, and decide the claims of the own message."""
     alter(model, state, world, receiver, tick)
