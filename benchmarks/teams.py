@@ -33,7 +33,7 @@ from sitegen.environments.sensing import fingerprint
 
 DRIVERS = ("route_follower", "look_ahead", "team_look_ahead")
 """Drivers beside the rule and the team."""
-BLOCK = 302
+BLOCK = 411
 """Block of held-out seeds on which neither rule nor team was tuned."""
 ABLATIONS = {
     "without messages": ("message_position", "message_forward", "message_mask", "message_age", "message_std"),
