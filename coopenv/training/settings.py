@@ -273,7 +273,8 @@ def continued_settings(path: Path, environment: str, **changes: Any) -> Settings
     own = read_settings(path, None, environment, **{**changes, "steps": team.steps})
     ppo = team.ppo.model_copy(update={"hidden": own.ppo.hidden, "observation_clip": own.ppo.observation_clip})
     overrides = {key: value for key, value in own.scenario.items() if not key.startswith("reward.")}
-    return team.model_copy(update={"ppo": ppo, "scenario": {**team.scenario, **overrides}})
+    changed = {"ppo": ppo, "scenario": {**team.scenario, **overrides}, "evaluation": team.evaluation}
+    return own.model_copy(update={**changed, "variations": own.variations or team.variations})
 
 
 def usual_settings(environment: str, overrides: Mapping[str, Any], **changes: Any) -> Settings:

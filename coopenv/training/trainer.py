@@ -105,7 +105,7 @@ COUNTS = f"{CRITIC}counts"
 """Tensor of an agent's weights: count of the observations; mean, variance and count of the returns."""
 BATCH = 512  # rows per gradient step
 LONGEST_ALONE = 0.25
-"""Share of the steps from which on the policy learns, too, whatever the critic explains."""
+"""Share of the steps, or of the minutes, from which on the policy learns, too, whatever the critic explains."""
 
 
 def watch(
@@ -316,7 +316,8 @@ class Trainer:
         """
         begin, cpu_begin = monotonic(), process_time()
         self._share = self._spent()
-        self.model.critic_alone = self.model.critic_alone and self._share < LONGEST_ALONE
+        ahead = max(self._spent(self._rollout), self.seconds / (60.0 * (self.plan.settings.minutes or math.inf)))
+        self.model.critic_alone = self.model.critic_alone and ahead <= LONGEST_ALONE
         with self._finite():
             self.model.learn(self._rollout, callback=self._watch, reset_num_timesteps=False)
         if self.model.critic_alone:
@@ -358,9 +359,9 @@ class Trainer:
         """Progress of the training."""
         return Status(self.model.num_timesteps, self.seconds, self._spent(), self._watch.figures())
 
-    def _spent(self) -> float:
+    def _spent(self, more: int = 0) -> float:
         steps = self.plan.settings.steps
-        return min(1.0, self.model.num_timesteps / steps) if steps else 1.0
+        return min(1.0, (self.model.num_timesteps + more) / steps) if steps else 1.0
 
     def tensors(self) -> Arrays:
         """Return a copy of networks and normalisation by the names of an agent's weights."""

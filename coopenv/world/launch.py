@@ -165,7 +165,7 @@ def kernel(function: Function, precision_name: str, differentiable: bool = False
     kind = ".differentiable" if differentiable else ""
     module = wp.get_module(f"{function.__module__}.{function.__name__}.{precision_name}{kind}")
     module.options.update(wp.get_module(function.__module__).options)
-    module.options.update(compiler_options(), enable_backward=differentiable, block_dim=THREADS_PER_BLOCK)
+    module.options.update(_own_options(), enable_backward=differentiable)
     return wp.Kernel(func=function, key=function.__name__, module=module)
 
 
@@ -179,8 +179,12 @@ def module_kernels(name: str, p: Any, *functions: Callable[..., None], **options
         options: of the module.
     """
     module = wp.get_module(f"coopenv.{name}.{p.name}")
-    module.options.update({**compiler_options(), **options}, enable_backward=False, block_dim=THREADS_PER_BLOCK)
+    module.options.update({**_own_options(), **options}, enable_backward=False)
     return {function.__name__: wp.Kernel(func=function, key=function.__name__, module=module) for function in functions}
+
+
+def _own_options() -> dict[str, Any]:
+    return {**compiler_options(), "block_dim": THREADS_PER_BLOCK, "source_rules": SOURCE_RULES}
 
 
 INLINE_THRESHOLD = 2000
@@ -196,15 +200,15 @@ def compiler_options() -> dict[str, Any]:
     The same for all modules, because Warp's headers are parsed once for each set of flags. LLVM keeps its own depth of
     vectorisation: Warp's smaller one slows large observers down.
     """
-    flags, rules = (wp.config.cpu_compiler_flags or "").split(), {"source_rules": SOURCE_RULES}
+    flags = (wp.config.cpu_compiler_flags or "").split()
     if not any("-inline-threshold" in flag for flag in flags):
-        return rules
+        return {}
     start_warp()
     kept = [flag for flag in flags if not flag.startswith("-mllvm")]
     if "-march=native" in kept and cpu_features() >= X86_64_V3:
         kept = [*(flag for flag in kept if flag != "-march=native"), "-target-cpu", "x86-64-v3"]
     threshold = f"-mllvm=-inline-threshold={INLINE_THRESHOLD}"
-    return {**rules, "cpu_compiler_flags": " ".join([*kept, threshold])}
+    return {"cpu_compiler_flags": " ".join([*kept, threshold])}
 
 
 MOST_THREADS = 1024

@@ -156,6 +156,11 @@ def test_the_critic_of_a_clone_learns_alone_at_first() -> None:
         np.array_equal(a["critic.layers.0.weight"], b["critic.layers.0.weight"]) for a, b in pairwise(states)
     )
     assert np.array_equal(states[0]["observation.mean"], states[-1]["observation.mean"])
+    short = trainer_of(steps=300, clone=clone)
+    short.begin()
+    before = short.tensors()["layers.0.weight"]
+    short.update()
+    assert not np.array_equal(short.tensors()["layers.0.weight"], before), "a training of one rollout learns, too"
     explaining = trainer_of(steps=8 * 512, clone=clone)
     explaining.begin()
     explaining.model.explained = 1.0

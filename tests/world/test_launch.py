@@ -20,7 +20,6 @@ from coopenv.sources.worlds import Simulated
 from coopenv.world import launch, state
 from coopenv.world import world as batches
 from coopenv.world.launch import start_warp
-from coopenv.world.warp_internals import SOURCE_RULES
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.processes import COOPENV, ROOT, small_disk
 
@@ -114,7 +113,7 @@ def test_tensors_share_memory_and_agree_with_numpy(device: str, autoreset: str) 
 @pytest.mark.parametrize("flags", [None, "", "-march=native -O0"])
 def test_flags_of_the_user_stay(monkeypatch: pytest.MonkeyPatch, flags: str | None) -> None:
     monkeypatch.setattr(wp.config, "cpu_compiler_flags", flags)
-    assert launch.compiler_options() == {"source_rules": SOURCE_RULES}
+    assert launch.compiler_options() == {}
 
 
 PACKAGE = Path(coopenv.__file__).parent

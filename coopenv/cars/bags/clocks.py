@@ -110,9 +110,8 @@ def checked(stamps: Times, received: Times) -> tuple[NDArray[np.bool_], Delay | 
 
 HOLE = 0.25  # s between two messages over which nothing is compared
 INTERVAL = 0.4  # s over which turns and distances are compared
-SEARCHED, COARSE, STEP = 1.0, 0.1, 0.02
-"""Search range of an offset to both sides, and steps of the search and of that around its result, s."""
-FINE = round(2.0 * COARSE / STEP)
+SEARCHED, STEP = 1.0, 0.02
+"""Search range of an offset to both sides, and step of the search, s."""
 THINNED = 1_000  # elements that are enough for the search
 BLOCK = 2.0  # s within which errors are taken as dependent
 SURE = 4.0  # standard errors above which an offset counts
@@ -207,7 +206,7 @@ def lead_by(residual: Residual, times: Array, most: float, least: float, *, scal
     """
     if len(times) < FEWEST:
         return None
-    rows, tried = slice(None, None, 1 + len(times) // THINNED), np.arange(-SEARCHED, SEARCHED + STEP / 2, COARSE)
+    rows, tried = slice(None, None, 1 + len(times) // THINNED), np.arange(-SEARCHED, SEARCHED + STEP / 2, STEP)
     given = [residual(offset, rows) for offset in tried]
     # Costs of different elements cannot be compared: only those count for which there is a value at every offset.
     if (common := _common(given)).sum() < FEWEST:
@@ -217,10 +216,7 @@ def lead_by(residual: Residual, times: Array, most: float, least: float, *, scal
         rest, w = fit(np.where(common, difference, np.nan), explained, scaled=scaled)
         return float((w * rest**2).sum() / w.sum()) if w.sum() >= FEWEST else np.inf
 
-    costs = np.array([cost(*each) for each in given])
-    fine = np.arange(max(-SEARCHED, tried[np.argmin(costs)] - COARSE), SEARCHED + STEP / 2, STEP)[: FINE + 1]
-    costs = np.append(costs, [cost(*residual(offset, rows)) for offset in fine])
-    tried = np.append(tried, fine)
+    costs = _between(np.array([cost(*each) for each in given]))
     best, known = int(np.argmin(costs)), costs[np.isfinite(costs)]
     if abs(tried[best]) > SEARCHED - STEP / 2 or len(known) < len(tried) / 2:
         return None
@@ -245,6 +241,18 @@ def lead_by(residual: Residual, times: Array, most: float, least: float, *, scal
         offset -= float(np.clip((w * slope * rest).sum() / information, -STEP, STEP))
     sums = np.bincount(((times - times.min()) / BLOCK).astype(int), w * slope * rest)
     return Lead(offset, float(np.hypot(np.sqrt((sums**2).sum()) / information, least)))
+
+
+def _between(costs: Array) -> Array:
+    """Return costs at even offsets, (n,): at a minimum, that of the parabola through it and its neighbours.
+
+    Motion that nearly repeats itself has minima a period apart, which are narrower than a step.
+    """
+    left, middle, right = costs[:-2], costs[1:-1], costs[2:]
+    with np.errstate(invalid="ignore"):
+        lower = (right - left) ** 2 / np.maximum(8.0 * (left + right - 2.0 * middle), 1e-300)
+        lowest = (middle <= left) & (middle <= right) & np.isfinite(left + right)
+    return np.concatenate([costs[:1], np.where(lowest, np.maximum(middle - lower, 0.0), middle), costs[-1:]])
 
 
 def _common(given: Sequence[tuple[Array, Array]]) -> NDArray[np.bool_]:

@@ -281,8 +281,8 @@ FROZEN = 1.0
 """s, least duration of equal values in a row."""
 SLOW = math.radians(1.0)
 """rad/s of a turn that is no more than a bias: of robots that hold a command, and whose odometry is the command."""
-NOISY = 0.02
-"""Share of equal neighbours below which values have noise."""
+NOISY = 0.3
+"""Share of the changes of a value that turn back at once above which it has noise; of white noise two thirds do."""
 SPIN = 6.0
 """rad/s, faster than a car turns: a body of motion capture whose markers were mistaken."""
 STUCK = 0.15
@@ -300,10 +300,11 @@ def _frozen_noise(car: CarStreams) -> Iterator[Diagnosis]:
     """Yield streams with noise of their own that repeat a value other than 0, which needs no other stream."""
     for kind, what, roles in (("wheel", "velocity", MOVING), ("gyro", "turn rate", TURNING)):
         time, values = car.tracks[f"{kind}_time"], car.tracks[kind]
-        same, inside, runs = np.diff(values) == 0.0, np.zeros(max(0, len(time) - 1), bool), [*frozen(time, values)]
+        change, runs = np.diff(values.real), [*frozen(time, values)]
+        back, inside = change[1:] * change[:-1] < 0.0, np.zeros(max(0, len(time) - 2), bool)
         for begin, end, _ in runs:
-            inside |= (time[1:] > begin) & (time[1:] <= end)
-        if inside.all() or same[~inside].mean() > NOISY:
+            inside |= (time[2:] > begin) & (time[2:] <= end)
+        if inside.all() or back[~inside].mean() < NOISY:
             continue
         for begin, end, first in runs:
             if values[first]:

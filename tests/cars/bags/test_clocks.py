@@ -121,6 +121,23 @@ def test_leads_of_gyro_and_camera(offset: float) -> None:
     assert against is not None and against.seconds == pytest.approx(offset, abs=0.015)
 
 
+@pytest.mark.parametrize(("period", "offset"), [(0.85, 0.25), (0.72, -0.15), (0.6, 0.35), (1.23, 0.23)])
+def test_a_motion_that_nearly_repeats_itself_has_the_lead_of_its_own_and_not_a_period_more(
+    period: float, offset: float
+) -> None:
+    """Minima of the cost stand a period apart, and each is narrow."""
+    t, rng = np.arange(0.0, 30.0, 0.01), np.random.default_rng(5)
+
+    def turned(time: np.ndarray) -> np.ndarray:
+        return np.sin(2 * np.pi * time / period) * (1.0 + 0.2 * np.sin(time / 3.0)) + 0.1 * np.sin(
+            2 * np.pi * time / 7.0
+        )
+
+    gyro = SampledSignal(t - offset, turned(t) + rng.normal(0.0, 0.002, len(t)))
+    found = lead_of_motion(gyro, SampledSignal(t[::2], turned(t[::2]) + rng.normal(0.0, 0.002, len(t[::2]))))
+    assert found is not None and found.seconds == pytest.approx(offset, abs=0.005)
+
+
 def test_a_motion_without_information_has_no_lead() -> None:
     t = np.arange(0.0, 20.0, 0.01)
     rng = np.random.default_rng(3)

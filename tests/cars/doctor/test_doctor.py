@@ -370,6 +370,22 @@ def test_a_stream_with_noise_that_sticks_is_found_without_motion_capture(kind: s
     assert re.search(r"in a row for 4\.\d s, and has noise", found.text) and found.treatment is Treatment.REFUSED
 
 
+def test_a_velocity_without_noise_that_is_held_does_not_stick() -> None:
+    """A ramp, an even speed and a ramp, as a simulator or a setpoint has them."""
+    t = np.arange(0.0, 25.0, 0.05)
+    speed = np.clip(np.minimum(0.2 * (t - 2.0), 0.2 * (23.0 - t)), 0.0, 0.35)
+    noise = 0.01 * np.random.default_rng(0).normal(size=len(t)) * ((t < 8.0) | (t > 12.0))
+
+    def found(values: np.ndarray) -> list[Any]:
+        tracks = {"wheel_time": t, "wheel": values + 0j, "gyro_time": t, "gyro": 0.1 * np.sin(t), "truth_time": t[:0]}
+        car: Any = SimpleNamespace(name="car", tracks=tracks, topic=lambda roles: "/wheel")
+        return [*of_frozen_streams(car)]
+
+    assert not found(speed)
+    [diagnosis] = found(speed + noise)
+    assert "0.35 in a row for" in diagnosis.finding.text
+
+
 def test_a_landmark_elsewhere_is_named_where_few_bearings_are_to_it() -> None:
     """The mean over all bearings is below what counts as bad."""
     car = streams_of(None).car("car")
