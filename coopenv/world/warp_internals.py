@@ -108,6 +108,12 @@ def _as_in_c(source: str, function: Callable[..., Any], device: str, options: Ma
     return re.sub(r"(\w+\*) (var_\w+)", r"\1 __restrict__ \2", head) + brace + body
 
 
+def _check_kept(source: str, function: Callable[..., Any], record: str) -> None:
+    """Raise a TypeError if a function writes to a field of a record that it has by reference, which is its caller's."""
+    if re.search(rf"^ *var_{record}\.\w+ = ", source, re.M):
+        raise TypeError(f"{function.__name__}: writes to a field of '{record}', a record of arrays; write to a copy")
+
+
 _generate_function: Any = codegen.codegen_func
 
 
@@ -124,6 +130,7 @@ def _function_source(adj: Any, *arguments: Any, **given: Any) -> str:
     source = _as_in_c(_generate_function(adj, *arguments, **given), adj.func, device, options)
     for arg in adj.args:
         if _has_arrays(arg.type):
+            _check_kept(source, adj.func, arg.label)
             source = source.replace(f"    {arg.ctype()} var_{arg.label}", f"    {arg.ctype()}& var_{arg.label}", 1)
     if getattr(adj.func, "outlined", False) and "WP_NOINLINE" not in source:
         source = source.replace("\nstatic ", "\nstatic WP_NOINLINE ", 1)
@@ -150,6 +157,7 @@ def _kernel_source(kernel: Any, device: str, options: Mapping[str, Any]) -> str:
     records = [(arg.ctype(), f"var_{arg.label}") for arg in kernel.adj.args if _has_arrays(arg.type)]
     if device == "cpu":
         for kind, name in records:
+            _check_kept(source, kernel.func, name.removeprefix("var_"))
             source = source.replace(f"{kind} {name} = _wp_args->", f"{kind}& {name} = _wp_args->")
         return source
     head, brace, body = source.partition("\n{\n")

@@ -33,8 +33,8 @@ def ours(function: Any) -> Any:
 @ours
 def total(table: Any, row: int) -> float:
     """Return the sum of a row, and write the row's number into its first place."""
-    found = 0.0
-    for k in range(table.rows.shape[1]):
+    found = table.rows[row, 0]
+    for k in range(1, table.rows.shape[1]):
         found += table.rows[row, k]
     table.rows[row, 0] = float(row)
     return found
@@ -58,6 +58,19 @@ def fill(table: Table, out: wp.array2d(dtype=wp.float32)):
     place = shifted(kept, row)
     out[row, 1] = place[0]
     out[row, 2] = place[1]
+
+
+@ours
+def exchange(table: Table, out: wp.array2d(dtype=wp.float32)):
+    """Write to a field of a record."""
+    table.rows = out
+
+
+def test_a_record_is_not_written_to() -> None:
+    """Each thread would find what the one before has written."""
+    made = module_kernels("samples_exchanged", precision("float32"), exchange)["exchange"]
+    with pytest.raises(TypeError, match="exchange: writes to a field of 'table', a record of arrays"):
+        wp.launch(made, 1, inputs=[Table(), wp.zeros((1, 1), dtype=wp.float32, device="cpu")], device="cpu")
 
 
 @pytest.mark.parametrize("step", [1, 2, 3])
