@@ -312,12 +312,11 @@ def save(path: Path, trainer: Trainer, course: Course, onnx: bool = False, logs:
     Raises:
         OutputError: it cannot be written; the one before is whole.
     """
-    spent = {"seconds": trainer.seconds, "cpu_seconds": trainer.cpu_seconds}
-    spent["critic_alone"] = trainer.model.critic_alone
+    state = {"critic_alone": trainer.model.critic_alone, "cpu_seconds": trainer.cpu_seconds}
     header = Checkpoint(
         plan=trainer.plan,
         scenario=trainer.scenario.model_dump_json(),
-        progress={"steps": trainer.model.num_timesteps, **spent},
+        progress={"steps": trainer.model.num_timesteps, "seconds": trainer.seconds, **state},
         course=course,
         onnx=onnx,
         logs=logs and logs.absolute(),

@@ -302,7 +302,10 @@ class Trainer:
             yield watch(each, worlds, clone, self.gamma, start, threads, report, rule, driving)
 
     def _differentiate(self, observations: torch.Tensor, targets: list[torch.Tensor], rows: torch.Tensor) -> None:
-        """Write the derivatives of the mean squared error of actions and values in some rows into `grad`."""
+        """Write the derivatives of the mean squared errors into `grad`.
+
+        Observations are (M, D), normalised, targets (M, A) and (M, 1); `rows` (B,) are the numbers of those that count.
+        """
         for layers, aims in zip(self.model.policy.layers(), targets, strict=True):
             found = outputs(layers, observations[rows])
             excess = found[-1] - aims[rows]
@@ -360,6 +363,7 @@ class Trainer:
         return Status(self.model.num_timesteps, self.seconds, self._spent(), self._watch.figures())
 
     def _spent(self, more: int = 0) -> float:
+        """Return the share of the steps, after `more` further ones."""
         steps = self.plan.settings.steps
         return min(1.0, (self.model.num_timesteps + more) / steps) if steps else 1.0
 

@@ -184,6 +184,7 @@ def module_kernels(name: str, p: Any, *functions: Callable[..., None], **options
 
 
 def _own_options() -> dict[str, Any]:
+    """Return the options of this package's modules."""
     return {**compiler_options(), "block_dim": THREADS_PER_BLOCK, "source_rules": SOURCE_RULES}
 
 

@@ -29,7 +29,7 @@ from warp._src import codegen, context
 from coopenv.base.plugins import loaded, own
 
 SOURCE_RULES = sha256(Path(__file__).read_bytes()).hexdigest()[:16]
-"""Of this file: an option of every module, as what Warp compiles is not its own text, of which it knows the hash."""
+"""Digest of this file, an option of every module: Warp's hash of a module does not see the rules for its source."""
 
 
 def cpu_features() -> frozenset[str]:

@@ -216,7 +216,7 @@ def lead_by(residual: Residual, times: Array, most: float, least: float, *, scal
         rest, w = fit(np.where(common, difference, np.nan), explained, scaled=scaled)
         return float((w * rest**2).sum() / w.sum()) if w.sum() >= FEWEST else np.inf
 
-    costs = _between(np.array([cost(*each) for each in given]))
+    costs = _refined(np.array([cost(*each) for each in given]))
     best, known = int(np.argmin(costs)), costs[np.isfinite(costs)]
     if abs(tried[best]) > SEARCHED - STEP / 2 or len(known) < len(tried) / 2:
         return None
@@ -243,7 +243,7 @@ def lead_by(residual: Residual, times: Array, most: float, least: float, *, scal
     return Lead(offset, float(np.hypot(np.sqrt((sums**2).sum()) / information, least)))
 
 
-def _between(costs: Array) -> Array:
+def _refined(costs: Array) -> Array:
     """Return costs at even offsets, (n,): at a minimum, that of the parabola through it and its neighbours.
 
     Motion that nearly repeats itself has minima a period apart, which are narrower than a step.

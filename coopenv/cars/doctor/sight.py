@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from coopenv.base.errors import listed
 from coopenv.cars.bags.clocks import CAMERAS
 from coopenv.cars.calibration.batch import misfits, seen_from
 from coopenv.cars.calibration.calibrate import INTRINSICS
@@ -63,10 +64,11 @@ class PosedSightings:
         """Return the mean of (2 sin(angle / 2))^2 up to 0.04 between rays and markers."""
         return float(misfits(self.ray, self.ahead))
 
-    def is_bad(self) -> bool:
-        """Return whether a coarse cause is looked for: all rays misfit, or most of those to one landmark."""
+    def misplaced(self) -> list[int]:
+        """Return the landmarks, by number, most of whose rays are off."""
         counts, off = np.bincount(self.target), np.bincount(self.target, self.off_deg() > OFF_DEG)
-        return self.misfit() >= BAD or bool(((off > MOST_OFF * counts) & (counts >= FEWEST)).any())
+        found: list[int] = np.flatnonzero((off > MOST_OFF * counts) & (counts >= FEWEST)).tolist()
+        return found
 
 
 def thinned(car: CarStreams) -> CarStreams | None:
@@ -315,9 +317,17 @@ def of_sight(given: CarStreams) -> Iterator[Diagnosis]:
 
     A short drive has none: from one place many look alike.
     """
-    if (car := thinned(given)) is None or not (sight := sight_of(car)).is_bad():
+    if (car := thinned(given)) is None:
         return
-    topic, found, changed = car.topic([Role.TRUTH]), explanation(car) if np.ptp(car.time) > LEAST_SECONDS else [], car
+    sight, lasts = sight_of(car), np.ptp(car.time) > LEAST_SECONDS
+    if (few := sight.misfit() < BAD) and not sight.misplaced():
+        return
+    topic, found, changed = car.topic([Role.TRUTH]), explanation(car) if lasts else [], car
+    if few and lasts and not found:
+        names = listed([car.names[k] for k in sight.misplaced()])
+        text = f"most bearings of {car.name} to landmark {names} are off by more than {OFF_DEG} deg: is it elsewhere?"
+        yield Diagnosis(Finding("landmarks", text, car=car.name, explained=False))
+        return
     for cause in found:
         changed = cause.change(changed)
     rest = f", and {sight_of(changed).off_share():.0%} with that mended" if found else ""

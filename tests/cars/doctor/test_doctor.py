@@ -399,6 +399,11 @@ def test_a_landmark_elsewhere_is_named_where_few_bearings_are_to_it() -> None:
     assert thin is not None and sight_of(thin).misfit() < BAD
     [found] = examine_cars([wrong]).findings
     assert "landmark SL2 stands at" in found.text
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("coopenv.cars.doctor.sight.MEETING", np.inf)
+        [found] = examine_cars([wrong]).findings
+    assert "to landmark SL2 are off by more than 3.6 deg: is it elsewhere?" in found.text, "lines that do not meet"
+    assert not found.explained
 
 
 def test_the_scale_of_wheels_is_that_of_the_arc_in_tight_turns() -> None:
