@@ -41,16 +41,21 @@ def cpu_features() -> frozenset[str]:
 
 
 @contextmanager
-def headers_precompiled(options: Mapping[str, Any]) -> Iterator[Callable[[], None]]:
-    """Compile Warp's headers for modules with these options; yields what lets a thread use them, instead of its own."""
-    module = wp.get_module("coopenv.headers")
+def headers_precompiled(name: str, options: Mapping[str, Any]) -> Iterator[Callable[[], None]]:
+    """Compile Warp's headers for modules with these options; yields what lets a thread use them, instead of its own.
+
+    They are compiled with a module of this name, which must not be in the cache.
+    """
+    module = context.Module(name, None)
     module.options.update(options, enable_backward=False)
     wp.Kernel(func=_nothing, key="nothing", module=module).module.load(context.get_device("cpu"), 1)
-    folders, own, threads = context.runtime._pch_dirs, threading.get_ident(), list[int]()
+    runtime: Any = context.runtime
+    folders, threads = runtime._pch_dirs, list[int]()
+    compiled = folders[threading.get_ident()]
 
     def share() -> None:
         threads.append(threading.get_ident())
-        folders[threads[-1]] = folders[own]
+        folders[threads[-1]] = compiled
 
     try:
         yield share
