@@ -281,7 +281,7 @@ def tridiagonal6(M: Any):
     zero = A.dtype(0.0)
     for k in range(4):
         tail = zero
-        for i in range(k + 2, 6):
+        for i in range(wp.static(k + 2), 6):
             tail += A[i, k] * A[i, k]
         head = A[k + 1, k]
         off[k] = head * head + tail
@@ -292,17 +292,17 @@ def tridiagonal6(M: Any):
             beta = A.dtype(1.0) / (norm * (norm - head))
             A[k + 1, k] = head - norm  # the column below the diagonal is now the reflection's vector v
             along = zero
-            for i in range(k + 1, 6):
+            for i in range(wp.static(k + 1), 6):
                 total = zero
-                for j in range(k + 1, 6):
+                for j in range(wp.static(k + 1), 6):
                     total += A[i, j] * A[j, k]
                 w[i] = beta * total
                 along += w[i] * A[i, k]
             along *= A.dtype(0.5) * beta
-            for i in range(k + 1, 6):
+            for i in range(wp.static(k + 1), 6):
                 w[i] -= along * A[i, k]
-            for i in range(k + 1, 6):
-                for j in range(k + 1, 6):
+            for i in range(wp.static(k + 1), 6):
+                for j in range(wp.static(k + 1), 6):
                     A[i, j] -= A[i, k] * w[j] + w[i] * A[j, k]
     for i in range(6):
         diagonal[i] = A[i, i]

@@ -296,7 +296,7 @@ def fused_kernels(source: Source, observer: Embedded, p: Precision, lanes: str |
                 follow_tick(model, state, memory, world, model.order[place], now)
             finish_tick(model, state, world, tick)
 
-    name, options = f"{source.name}_{observer.name}", {"max_unroll": 1, **observer.options}
+    name, options = f"{source.name}_{observer.name}", dict(observer.options)
     if lanes is not None:
         stages = (*source.in_lanes, deliver, *observer.parts, sample_gramian, broadcast_estimate, count_bytes)
         name, functions = f"{name}_{lanes}_in_lanes", (f.func.__name__ for f in stages)

@@ -203,7 +203,7 @@ def closest_approach_driving(ahead: wp.vec4, step: wp.float32, speed: wp.float32
         position: of the neighbour, m, body frame.
         forward: heading of the neighbour, unit vector, body frame.
     """
-    closest, begin, at = wp.float32(FAR), wp.float32(0.0), wp.vec2()
+    closest, begin, at = FAR, 0.0, wp.vec2()
     for k in range(4):
         if begin < FORESIGHT:
             to = step * wp.vec2(wp.cos(ahead[k]), wp.sin(ahead[k]))

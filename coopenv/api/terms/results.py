@@ -360,11 +360,9 @@ def step_results(
 
 @cache
 def results_kernel(p: Precision) -> wp.Kernel:
-    """Return `step_results` for a precision; loops stay loops, which compiles faster."""
-    generic = kernel(step_results, p.name)
-    generic.module.options["max_unroll"] = 1
+    """Return `step_results` for a precision."""
     records = {"model": model_struct(p), "state": state_struct(p), "results": results_struct(p)}
-    return wp.overload(generic, records)
+    return wp.overload(kernel(step_results, p.name), records)
 
 
 def team_results(
