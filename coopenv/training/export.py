@@ -99,6 +99,7 @@ def _network(trainer: Trainer, digest: str) -> NetworkCard:
             if name != "time_left"  # goes on for vehicles that have arrived
         },
         right_of_way=trainer.plan.settings.right_of_way,
+        alone=trainer.plan.settings.alone,
     )
 
 
