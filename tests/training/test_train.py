@@ -290,7 +290,7 @@ def test_an_environment_that_changed_since(here: Path, capsys: pytest.CaptureFix
             "right_of_way: the observation lacks axis_std",
         ),
         (["train", "facade", "--settings", "alone.toml"], "alone: the observation lacks message_mask"),
-        (["train", "lighthouse", "--settings", "wrong.toml"], "alone: unknown agent 'nobody'"),
+        (["train", "urban_crossing", "--settings", "wrong.toml"], "alone: unknown agent 'nobody'"),
     ],
 )
 def test_mistakes_are_one_line(
