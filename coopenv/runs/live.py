@@ -32,7 +32,7 @@ class LiveWorld:
         self.scenario, self.engine = scenario, Engine(scenario)
         self.stride = frame_stride(scenario)
         """Camera ticks between pictures."""
-        self._view = TopView(self.engine.backend.scenario)  # which may know of roads
+        self.view = TopView(self.engine.backend.scenario)  # which may know of roads
         with compile_notice(log):
             self.engine.load()
 
@@ -40,22 +40,8 @@ class LiveWorld:
         """Play an episode and yield its pictures; the last one is of the end."""
         for tick in play(self.engine, [seed], self.scenario.horizon_ticks, policy, to_the_end=False):
             if tick % self.stride == 0:
-                yield self._view.draw(self.engine)
-        yield self._view.draw(self.engine)
-
-    def start(self, seed: int, window: PictureWindow) -> None:
-        """Show the start of an episode."""
-        self.engine.reset([seed])
-        window.show(self._view.draw(self.engine))
-
-    def run(self, policy: Policy, seed: int, window: PictureWindow, speed: float, going: Callable[[], bool]) -> None:
-        """Show an episode at a multiple of real time while `going` returns True."""
-        begin, period = time.monotonic(), self.stride / self.scenario.rates.camera / speed
-        for number, picture in enumerate(self.pictures(policy, seed), start=1):
-            window.show(picture)
-            if not going():
-                return
-            time.sleep(max(0.0, begin + number * period - time.monotonic()))
+                yield self.view.draw(self.engine)
+        yield self.view.draw(self.engine)
 
     def outcomes(self) -> list[str]:
         """Return a line per vehicle: how it has ended so far, and how well it knows its place."""
@@ -81,8 +67,14 @@ def watch(
     if not window.is_open:
         raise CoopenvError("there is no display to open a window on; --out DIR writes a film instead")
     stage = LiveWorld(scenario, log)
-    stage.start(seed, window)
-    stage.run(policy, seed, window, speed, lambda: window.is_open)
+    stage.engine.reset([seed])
+    window.show(stage.view.draw(stage.engine))
+    begin, period = time.monotonic(), stage.stride / scenario.rates.camera / speed
+    for number, picture in enumerate(stage.pictures(policy, seed), start=1):
+        window.show(picture)
+        if not window.is_open:
+            break
+        time.sleep(max(0.0, begin + number * period - time.monotonic()))
     return stage
 
 
