@@ -120,7 +120,7 @@ class ObserverOptions(options.DataOptions):
     @property
     def names(self) -> list[str] | None:
         """The observers that were given; None: all that suit."""
-        return None if self.observers is None else arguments.words(self.observers)
+        return [word.strip() for word in self.observers.split(",")] if self.observers is not None else None
 
     def plan(self) -> "Plan":
         """Return the comparison, everything in it checked."""
