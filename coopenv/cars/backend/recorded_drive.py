@@ -258,13 +258,7 @@ class RecordedTransport:
     """
 
     def __init__(self, transport: Transport, recorder: DriveRecorder, aside: Iterable[str] = ()) -> None:
-        """Wrap a transport.
-
-        Args:
-            transport: the network.
-            recorder: records all messages that are sent, and presence.
-            aside: topics of which no ticks are made: what comes on them is written at once.
-        """
+        """Wrap a transport; what comes on topics `aside`, of which no ticks are made, is written at once."""
         self._transport, self._recorder, self.clock = transport, recorder, transport.clock
         self.subscribe, self.announce, self.watch = transport.subscribe, transport.announce, transport.watch
         self.close = transport.close

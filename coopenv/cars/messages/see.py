@@ -4,6 +4,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import dataclass
 from queue import Empty, Queue
 from typing import Any
 
@@ -27,24 +28,22 @@ def object_bearings(markers: Iterable[int], rays: Iterable[Iterable[float]]) -> 
 MOST_REASONS = 100  # that are counted; errors quote what a message holds
 
 
+@dataclass(eq=False)
 class FrameReader:
     """Publishes the bearings of tags in frames, the newest first; frames that come in the meantime are left out."""
 
-    def __init__(self, car: str, profile: CarProfile, calibration: Calibration, transport: Transport) -> None:
-        """Subscribe to the frames of a car.
+    car: str
+    profile: CarProfile  # whose detections are frames
+    calibration: Calibration
+    transport: Transport  # stays the caller's
 
-        Args:
-            car: its name.
-            profile: of its make, whose detections are frames.
-            calibration: of its camera.
-            transport: the network; stays the caller's.
-        """
-        self._car, self._profile, self._calibration, self._transport = car, profile, calibration, transport
-        self._topics = {role: profile.topic_of(car, role) for role in (Role.DETECTIONS, Role.BEARINGS)}
+    def __post_init__(self) -> None:
+        """Subscribe to the frames of the car."""
+        self._topics = {role: self.profile.topic_of(self.car, role) for role in (Role.DETECTIONS, Role.BEARINGS)}
         self._newest = Queue[Arrival](1)
         self.counts = Counter[str]()
         """Frames that were `read` or `left out`, and the others by the reason for which they are not used."""
-        transport.subscribe(self._topics[Role.DETECTIONS], self._keep)
+        self.transport.subscribe(self._topics[Role.DETECTIONS], self._keep)
 
     def _keep(self, arrival: Arrival) -> None:
         with suppress(Empty):
@@ -68,15 +67,15 @@ class FrameReader:
             return
         self.counts[reason] += 1
         if self.counts[reason] == 1:
-            print(f"{self._car}: {line}", file=sys.stderr, flush=True)
+            print(f"{self.car}: {line}", file=sys.stderr, flush=True)
 
     def publish(self, arrival: Arrival) -> None:
         """Publish the bearings of a frame, stamped with the middle of its exposure. Raises CoopenvError: it is none."""
-        message = decode(arrival.payload, self._profile.topics[Role.DETECTIONS].type)
-        found = read(Role.DETECTIONS, message, self._calibration, vision=self._profile.vision)
+        message = decode(arrival.payload, self.profile.topics[Role.DETECTIONS].type)
+        found = read(Role.DETECTIONS, message, self.calibration, vision=self.profile.vision)
         assert isinstance(found, Detections)
-        topic, entries = self._profile.topics[Role.BEARINGS], object_bearings(found.markers, found.bearings.tolist())
+        topic, entries = self.profile.topics[Role.BEARINGS], object_bearings(found.markers, found.bearings.tolist())
         about = header(stamp_of(message) + found.late, message.header.frame_id)
         payload = encode(make(topic.type, header=about, bearing=entries))
-        self._transport.publish(self._topics[Role.BEARINGS], payload, urgent=topic.urgent, reliable=topic.reliable)
+        self.transport.publish(self._topics[Role.BEARINGS], payload, urgent=topic.urgent, reliable=topic.reliable)
         self.counts["read"] += 1
