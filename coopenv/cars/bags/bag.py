@@ -201,7 +201,6 @@ class Bag(TickGenerator):
     @property
     def streams(self) -> Streams:
         """Every stream once, on one clock."""
-        assert self.log.streams is not None
         return replace(self.log.streams, binding=self.binding)
 
     @property

@@ -131,16 +131,13 @@ def calibrate(drive: CalibrationDrive, truth: bool = True) -> Calibrated:
         DataError: the poses of a car are not determined.
     """
     try:
-        return _calibrated(Batch(drive, truth))
+        batch = Batch(drive, truth)
+        pairs = exchanged(batch)
+        given = batch.fit(batch.begin())
+        return _result(batch, given, corrected(batch, given), pairs)
     except np.linalg.LinAlgError as error:
         names = ", ".join(car.name for car in drive.cars)
         raise DataError(f"{names}: the drive does not determine the poses ({error})") from None
-
-
-def _calibrated(batch: Batch) -> Calibrated:
-    pairs = exchanged(batch)
-    given = batch.fit(batch.begin())
-    return _result(batch, given, corrected(batch, given), pairs)
 
 
 def corrected(batch: Batch, given: Fit, tried_most: int = TRIED, least: float = -np.inf) -> Fit:

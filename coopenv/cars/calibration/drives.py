@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from coopenv.base.errors import DataError
-from coopenv.cars.doctor.streams import CarStreams, Streams
+from coopenv.cars.doctor.streams import CarSight, CarStreams, Streams
 from coopenv.cars.messages.readings import yaw_of
 from coopenv.cars.messages.vision import Calibration, rays
 from coopenv.cars.settings.profile import Role
@@ -37,18 +37,10 @@ ROLES = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class CarDrive:
-    """Measurements of one car; times in s on one clock, planar vectors as complex numbers x + iy."""
+class CarDrive(CarSight):
+    """Measurements of one car, its camera as given; planar vectors are complex numbers x + iy."""
 
-    name: str
-    vehicle: int
-    mounting: Array  # (3, 3) camera to body, as given
-    lever: Array  # (3,) optical centre in the body, as given, m
-    lens: Calibration | None  # as given; None: bearings without pixels
-    time: Array  # (n,) of sightings
-    target: NDArray[np.int64]  # (n,) landmark
-    ray: Array  # (n, 3) unit vectors, optical frame, by the given lens
-    pixel: Array  # (n, 2); of no use without a lens
+    pixel: Array  # (m, 2) of sightings; of no use without a lens
     wheel_time: Array
     wheel: NDArray[np.complex128]  # m/s, body
     gyro_time: Array
@@ -56,7 +48,6 @@ class CarDrive:
     truth_time: Array
     truth: NDArray[np.complex128]  # m, map
     truth_yaw: Array  # rad
-    height: float  # m, of the body's origin
     topics: tuple[tuple[str, float], ...] = (("", 0.0),) * 3
     """Topics of camera, wheels and motion capture, and s that were added to their stamps."""
     gyro_added: float = 0.0  # s that were added to the stamps of turn rates, against which all offsets count
@@ -86,12 +77,8 @@ def car_of(car: CarStreams, where: str, **more: Any) -> CarDrive:
     """
     pixel = np.zeros((len(car.ray), 2)) if car.lens is None else np.round(car.lens.pixels(car.ray), 3)
     tracks = {key: value for key, value in car.tracks.items() if "command" not in key}
-    same = {key: getattr(car, key) for key in SAME}
+    same = {field.name: getattr(car, field.name) for field in fields(CarSight)}
     return _of_use(CarDrive(pixel=pixel, **tracks, **same, **more), where)
-
-
-SAME = ("name", "vehicle", "mounting", "lever", "height", "lens", "time", "target", "ray")
-"""Fields that a drive takes over."""
 
 
 def _of_use(car: CarDrive, where: str) -> CarDrive:

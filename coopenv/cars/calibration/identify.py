@@ -186,7 +186,7 @@ def _distances(
     commands = [(s.stamp, s.value) for s in drives if s.stamp < end and isinstance(s.value, MotionCommand)]
     truth = (s for s in bag.log.samples if (s.car, s.role) == (car, Role.TRUTH) and s.stamp >= drives[0].stamp)
     pose = next((s.value for s in truth if isinstance(s.value, CarPose)), None)
-    shift = {role: round(bag.log.added[car, role][1] * 1e9) for role in sent}
+    shift = {role: round(bag.log.streams.added[car, role][1] * 1e9) for role in sent}
     first, last = drives[0].stamp, commands[-1][0]
     inside = {role: [s for s in sent[role] if first <= s.stamp + shift[role] < last] for role in sent}
     overrides, fake = tables(rows)
