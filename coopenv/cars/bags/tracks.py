@@ -45,12 +45,9 @@ class Clocks:
 
 
 def reconcile(files: Sequence[Delays], tolerance: float, stated: Mapping[str, int]) -> Clocks:
-    """Return the corrections of the times of every source and file.
+    """Return the corrections of the times of every source and file, by the delays in each.
 
-    Args:
-        files: delays of the sources of each file.
-        tolerance: ns up to which clocks count as the same.
-        stated: ns to add to the stamps of sources, by the map.
+    Clocks count as the same up to a tolerance, ns; `stated` is added to the stamps of sources, ns, by the map.
     """
     behind = recorders(files)
     found: dict[str, Shift] = {}

@@ -20,10 +20,7 @@ def constant_turn_rate(
 ) -> str | None:
     """Return in words what contradicts a turn rate that is the same in all messages of a car; None: nothing does.
 
-    Args:
-        tracks: of a car, see `coopenv.cars.messages.readings.tracks_of`.
-        sightings: as of `CarStreams.sightings_in_plane`.
-        wheelbase: of the car, m.
+    Tracks and sightings are as of `CarStreams`, the latter in the plane; the wheelbase is in m.
     """
     rates = tracks["gyro"]
     if len(rates) < 2 or np.ptp(rates) > 0.0:
