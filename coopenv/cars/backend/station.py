@@ -320,8 +320,7 @@ class Gates:
         """Send a message on a topic of a car, signed."""
         topic = self.profile.topic_of(car, role)
         signature = b"" if self.signer is None else self.signer.sign(topic, payload)
-        kind = self.profile.topics[role]
-        self.transport.publish(topic, payload, signature, urgent=kind.urgent, reliable=kind.reliable)
+        self.transport.publish(topic, payload, signature, **self.profile.topics[role].way)
 
 
 BYPASSED = (

@@ -63,8 +63,7 @@ class SensorPublisher:
                 fields[name] = fields[name][name]
         held = {name: value for name, value in fields.items() if name in known}
         payload = encode(make(topic.type, header=header(stamp, frame), **held))
-        name = self.profile.topic_of(self.name, role)
-        self.network.publish(name, payload, urgent=topic.urgent, reliable=topic.reliable)
+        self.network.publish(self.profile.topic_of(self.name, role), payload, **topic.way)
 
 
 @dataclass(eq=False)
@@ -229,12 +228,7 @@ class FakeCamera:
         self.publisher.send(Role.DETECTIONS, begin, "camera", **self._fields(frame))
 
     def _camera_info(self, _due: int, stamp: int) -> None:
-        c = self._calibration
-        (fx, fy), (cx, cy), (width, height) = c.focal_length, c.principal_point, c.image_size
-        matrices = {"d": c.distortion, "k": (fx, 0, cx, 0, fy, cy, 0, 0, 1), "r": np.eye(3)}
-        fields = {"width": width, "height": height, "distortion_model": "plumb_bob", **matrices}
-        fields["p"] = (fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0)
-        self.publisher.send(Role.CAMERA_INFO, stamp, "camera", **fields)
+        self.publisher.send(Role.CAMERA_INFO, stamp, "camera", **self._calibration.info)
 
     def _spots(self, now: int) -> list[Spot]:
         """Take a frame at a time in ns; return its markers, the nearest first, with faults."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from math import isinf
-from typing import Annotated
+from typing import Annotated, Unpack
 
 from pydantic import Field
 
@@ -19,7 +19,7 @@ from coopenv.base.fault_text import Fault, FaultError, FaultKind, parse_fault
 from coopenv.base.sections import Section
 from coopenv.cars.link.transport import Arrival, Callback, Transport
 from coopenv.cars.settings.limits import Number, Positive
-from coopenv.cars.settings.profile import PREFIX
+from coopenv.cars.settings.profile import PREFIX, Way
 
 Share = Annotated[float, Field(ge=0.0, lt=0.5)]
 Seconds = Annotated[float, Field(ge=0.0, le=60.0)]
@@ -139,11 +139,9 @@ class Wire:
         self.announce, self.watch, self.clock = self.transport.announce, self.transport.watch, self.transport.clock
         self._rng, self._late = random.Random(self.seed), sched.scheduler(self.steady, lambda _: None)
 
-    def publish(
-        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
-    ) -> None:
+    def publish(self, topic: str, payload: bytes, attachment: bytes = b"", **way: Unpack[Way]) -> None:
         """Send, see `Transport`."""
-        self._pass_on(lambda: self.transport.publish(topic, payload, attachment, urgent=urgent, reliable=reliable))
+        self._pass_on(lambda: self.transport.publish(topic, payload, attachment, **way))
 
     def subscribe(self, pattern: str, callback: Callback) -> None:
         """Subscribe, see `Transport`."""

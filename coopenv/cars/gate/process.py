@@ -115,13 +115,12 @@ class GateConnection:
             self.news.set()
 
     def _send(self, role: Role, payload: bytes, attachment: bytes = b"") -> None:
-        topic = self.gate.profile.topics[role]
         if role is Role.MANUAL:
             with self._lock:
                 self._sent[payload] = True
                 if len(self._sent) > MOST_SENT:
                     del self._sent[next(iter(self._sent))]
-        self.transport.publish(self._topics[role], payload, attachment, urgent=topic.urgent, reliable=topic.reliable)
+        self.transport.publish(self._topics[role], payload, attachment, **self.gate.profile.topics[role].way)
 
 
 def notify_systemd(state: str) -> None:

@@ -77,5 +77,5 @@ class FrameReader:
         topic, entries = self.profile.topics[Role.BEARINGS], object_bearings(found.markers, found.bearings.tolist())
         about = header(stamp_of(message) + found.late, message.header.frame_id)
         payload = encode(make(topic.type, header=about, bearing=entries))
-        self.transport.publish(self._topics[Role.BEARINGS], payload, urgent=topic.urgent, reliable=topic.reliable)
+        self.transport.publish(self._topics[Role.BEARINGS], payload, **topic.way)
         self.counts["read"] += 1
