@@ -17,7 +17,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError, DataWarning, listed
 from coopenv.base.files import replacing_folder, writing
 from coopenv.cars.backend.binding import marker_places
-from coopenv.cars.bags.files import METADATA, check_extra
+from coopenv.cars.bags.files import METADATA  # which names a missing extra
 from coopenv.cars.messages.codec import encode, header, make, pose, ros2
 from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.profile import TRANSFORMS
@@ -71,11 +71,8 @@ def write_bag(recording: Recording, folder: str | Path, estimates: Run | None = 
 
     Without a scenario there is no map, and without an observer's estimates no topic `estimate`.
 
-    Raises:
-        CoopenvError: the extra `log` is not installed.
-        OutputError: the folder cannot be written.
+    Raises OutputError: the folder cannot be written.
     """
-    check_extra()
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     folder, scenario = Path(folder), recording.scenario
