@@ -17,20 +17,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import DataError
-from coopenv.cars.calibration.batch import (
-    BIAS,
-    CAMERA_TIME,
-    LEVER,
-    ROT,
-    SCALE,
-    TRUTH_TIME,
-    WHEEL_TIME,
-    Batch,
-    Fit,
-    standard_errors,
-    stated_rate,
-)
+from coopenv.cars.calibration.batch import Batch, Fit, standard_errors, stated_rate
 from coopenv.cars.calibration.drives import CalibrationDrive
+from coopenv.cars.calibration.parameters import BIAS, CAMERA_TIME, LEVER, ROT, SCALE, TRUTH_TIME, WHEEL_TIME
 from coopenv.estimation.lens import PLUMB_BOB
 from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import Mask

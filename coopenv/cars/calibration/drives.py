@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,8 @@ from coopenv.cars.messages.vision import Calibration, rays
 from coopenv.cars.settings.profile import Role
 from coopenv.cars.settings.sensors import Correction
 from coopenv.estimation.poses import Array, log_so3
+from coopenv.observers.recording import Recording
 from coopenv.scenario import Scenario
-
-if TYPE_CHECKING:
-    from coopenv.observers.recording import Recording
 
 NS = 1e-9
 LEAST_SIGHTINGS, LEAST_SECONDS = 50, 5.0
@@ -128,7 +126,7 @@ def _of_car(streams: Streams, car: CarStreams, where: str) -> CarDrive:
     return car_of(car, where, corrected=(right.wheel_scale, right.gyro_bias), **known)
 
 
-def drive_of_recording(recording: "Recording", path: Path) -> CalibrationDrive:
+def drive_of_recording(recording: Recording, path: Path) -> CalibrationDrive:
     """Return the drive of a log of coopenv. Raises DataError: it is not one of cars, or a car has too few sightings."""
     r = recording
     if r.scenario is None or r.pan is not None:
@@ -142,7 +140,7 @@ def drive_of_recording(recording: "Recording", path: Path) -> CalibrationDrive:
     return CalibrationDrive(cars, streamed[0].names, streamed[0].places, r.scenario)
 
 
-def streams_of_recording(recording: "Recording") -> list[CarStreams]:
+def streams_of_recording(recording: Recording) -> list[CarStreams]:
     """Return the streams of the vehicles of a recording, whose cameras do not turn.
 
     Without an environment, rays are those of the body frame.
@@ -151,7 +149,7 @@ def streams_of_recording(recording: "Recording") -> list[CarStreams]:
     return [_of_vehicle(recording, i, static) for i in range(len(recording.setups))]
 
 
-def _of_vehicle(r: "Recording", i: int, static: NDArray[np.int64]) -> CarStreams:
+def _of_vehicle(r: Recording, i: int, static: NDArray[np.int64]) -> CarStreams:
     setup, scenario, middle = r.setups[i], r.scenario, r.t[1:] - 0.5 * r.dt
     camera = None if scenario is None else scenario.cameras[i]
     mounting = np.eye(3) if camera is None else camera.to_body()

@@ -21,9 +21,10 @@ from coopenv.base.files import replace_text
 from coopenv.cars.bags.bag import open_bags
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topics import cars_of, examined, markers_of
-from coopenv.cars.calibration.batch import BIAS, CAMERA_TIME, LATE, NUISANCE, ROT, Batch, Fit
+from coopenv.cars.calibration.batch import LATE, Batch, Fit
 from coopenv.cars.calibration.calibrate import errors
 from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive, drive_of_streams
+from coopenv.cars.calibration.parameters import BIAS, CAMERA_TIME, NUISANCE, ROT
 from coopenv.cars.settings.profile import Role
 from coopenv.cars.settings.toml import toml_text
 from coopenv.estimation.poses import Array, about_z
@@ -239,14 +240,9 @@ class Room:
 def survey(bags: Sequence[Path], like: str, folder: Path, truth: bool = True) -> Survey:
     """Solve the places of all markers of a drive, and write `environment.toml` and `topics.toml` into a folder.
 
-    Args:
-        bags: of one drive.
-        like: environment whose cameras, noise and observer count.
-        folder: where the files go.
-        truth: whether motion capture counts.
+    Cameras, noise and observer are those of the environment that it is like; `truth`: whether motion capture counts.
 
-    Raises:
-        CoopenvError: a bag cannot be read, or the drive does not determine the places.
+    Raises CoopenvError: a bag cannot be read, or the drive does not determine the places.
     """
     template, title = load_scenario(like), listed([path.name for path in bags])
     with ExitStack() as stack:

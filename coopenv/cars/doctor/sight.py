@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import listed
 from coopenv.cars.bags.clocks import CAMERAS
-from coopenv.cars.calibration.batch import misfits, seen_from
 from coopenv.cars.calibration.calibrate import INTRINSICS
 from coopenv.cars.calibration.drives import LEAST_SECONDS
+from coopenv.cars.calibration.resection import misfits, seen_from
 from coopenv.cars.doctor.finding import Change, Diagnosis, Finding, Treatment, with_error
 from coopenv.cars.doctor.streams import CarStreams, Planar
 from coopenv.cars.messages.vision import Calibration, rays
