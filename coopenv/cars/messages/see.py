@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
-from queue import Empty, Queue
+from queue import Empty, Full, Queue
 from typing import Any
 
 from coopenv.base.errors import CoopenvError
@@ -23,6 +23,31 @@ def object_bearings(markers: Iterable[int], rays: Iterable[Iterable[float]]) -> 
     rows = ((marker, *ray) for marker, ray in zip(markers, rays, strict=True))
     kind = "pixy_camera/msg/ObjectBearing"
     return [make(kind, id=n, bearing_x=-x, bearing_y=-y, bearing_z=-z) for n, x, y, z in rows]
+
+
+def next_message(transport: Transport, topic: str, kind: str, patience: float) -> Any | None:
+    """Return the next message of a topic that is of a type (None: none within s); whatever else comes is dropped."""
+    received = Queue[Any](1)
+
+    def keep(arrival: Arrival) -> None:
+        with suppress(CoopenvError, Full):
+            received.put_nowait(decode(arrival.payload, kind))
+
+    transport.subscribe(topic, keep)
+    with suppress(Empty):
+        return received.get(timeout=patience)
+    return None
+
+
+def published_calibration(car: str, profile: CarProfile, transport: Transport, patience: float) -> Calibration:
+    """Return the calibration that a car's camera publishes. Raises CoopenvError: none for s, or it cannot be read."""
+    topic = profile.topic_of(car, Role.CAMERA_INFO)
+    info = next_message(transport, topic, profile.topics[Role.CAMERA_INFO].type, patience)
+    if info is None:
+        raise CoopenvError(f"{car}: no calibration of its camera for {patience:g} s on {topic}")
+    calibration = read(Role.CAMERA_INFO, info, vision=profile.vision)
+    assert isinstance(calibration, Calibration)
+    return calibration
 
 
 MOST_REASONS = 100  # that are counted; errors quote what a message holds
