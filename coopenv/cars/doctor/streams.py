@@ -83,15 +83,14 @@ class CarStreams(CarSight):
         time, place, yaw = (self.tracks[name] for name in ("truth_time", "truth", "truth_yaw"))
         if len(time) < 2:
             return None
-        return SampledSignal(time, np.column_stack([place.real, place.imag])), SampledSignal(time, np.unwrap(yaw))
+        return SampledSignal(time, place), SampledSignal(time, np.unwrap(yaw))
 
     @property
     def own_signals(self) -> tuple[SampledSignal, SampledSignal] | None:
         """Place and heading by the poses of the odometry's own messages; None: it has none, or they never change."""
         if len(self.pose_time) < 2 or np.ptp(np.abs(self.pose - self.pose[0])) == 0.0:
             return None
-        place = np.column_stack([self.pose.real, self.pose.imag])
-        return SampledSignal(self.pose_time, place), SampledSignal(self.pose_time, self.pose_yaw)
+        return SampledSignal(self.pose_time, self.pose), SampledSignal(self.pose_time, self.pose_yaw)
 
     def with_tracks(self, **tracks: Any) -> Self:
         """Return the streams with other tracks."""

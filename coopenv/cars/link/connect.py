@@ -7,11 +7,9 @@ from coopenv.cars.settings.deployment import Deployment, DeploymentError
 
 
 def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:
-    """Connect to the network of a fleet; topics are the profile's on every kind of network.
+    """Connect to the network of a fleet, within a time for its router, broker or master, s.
 
-    Args:
-        deployment: the network and its certificates.
-        timeout: s to wait for the router, broker or master.
+    Topics are the profile's on every kind of network.
 
     Raises:
         DeploymentError: certificates that cannot be used, or what the kind of network cannot do.
