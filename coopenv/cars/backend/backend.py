@@ -45,7 +45,7 @@ READY_TIME = 2.0  # s to wait until all conditions of arming hold at once; cars 
 SETTLE = 0.5  # s for fakes to settle at their start
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Svea:
     """Cars as a source of ticks.
 

@@ -189,7 +189,7 @@ class Condition(NamedTuple):
     since: float = float("-inf")  # s, steady: when the condition held
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class StatusBoard:
     """Last condition of each car, and the reasons to stop it since arming."""
 

@@ -29,7 +29,7 @@ def refusal(arrival: Arrival, verifier: Verifier | None = None, signers: Collect
     return "" if verifier.signer(arrival.topic, arrival.payload, arrival.attachment) in signers else "signature"
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Station:
     """Keeps messages by topic; its callbacks run in threads of the transport and only store."""
 
@@ -164,7 +164,7 @@ class GateState:
         return self.clock.seconds() - self.received
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Gates:
     """Sessions with the gates of some cars."""
 

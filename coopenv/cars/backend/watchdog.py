@@ -197,7 +197,7 @@ class Trip:
     time: float = 0.0  # steady, s
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Watchdog:
     """Watches armed cars. Once it has stopped them, they stand until it is armed again."""
 

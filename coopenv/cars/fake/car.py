@@ -35,7 +35,7 @@ MOST_WAITING, MOST_LINES = 256, 100
 """Messages that wait for the next turn, the oldest of more are dropped; and errors of messages that are printed."""
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Fake:
     """A fake car, a vehicle or a moving landmark; `advance` runs all due events in one thread."""
 

@@ -66,7 +66,7 @@ class SensorPublisher:
         self.network.publish(self.profile.topic_of(self.name, role), payload, **topic.way)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class CarSensors:
     """Odometry and condition of one car. Lasting errors are drawn by the world."""
 
@@ -171,7 +171,7 @@ class Spot(NamedTuple):
     age: int = 1  # frames in a row
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class FakeCamera:
     """The camera of one car."""
 

@@ -124,7 +124,7 @@ class CarFaults:
         ]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Wire:
     """A transport on which messages get lost, come late, or stop, both ways; its owner calls `flush`."""
 

@@ -83,7 +83,7 @@ MOST_BYTES = 512  # of a message to the gate; its own have less than 300
 MOST_DIGITS = 18  # of a sequence number
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Gate:
     """The gate of one car; calls from several threads are to be kept apart."""
 

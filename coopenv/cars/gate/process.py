@@ -26,7 +26,7 @@ LAST_NEUTRALS = 5  # that the car gets before the gate goes
 MOST_SENT = 1200  # own commands that may be under way: a minute
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class GateConnection:
     """A gate and its connection; its owner calls `tick` every 50 ms, from one thread."""
 

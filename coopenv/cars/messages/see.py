@@ -53,7 +53,7 @@ def published_calibration(car: str, profile: CarProfile, transport: Transport, p
 MOST_REASONS = 100  # that are counted; errors quote what a message holds
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class FrameReader:
     """Publishes the bearings of tags in frames, the newest first; frames that come in the meantime are left out."""
 
