@@ -185,7 +185,8 @@ def errors(batch: Batch, fit: Fit) -> Array:
 def wrong(batch: Batch, fit: Fit, error: Array, coarse: float = 1.0) -> tuple[Mask, Mask]:
     """Return which constants are wrong, and which are off, yet within the noise by which the environment draws them.
 
-    Free constants of the fit may be wrong; (G,) are their standard errors. What counts as wrong is times `coarse`.
+    Free constants of the fit may be wrong; `error` (G,) are their standard errors. Deviations and standard errors that
+    count as wrong are `coarse` times as large.
     """
     finest = coarse * np.array([FINEST[kind.unit] for kind in batch.kinds])
     off, drawn = fit.free & (np.abs(fit.x) > np.maximum(coarse * SIGNIFICANT * error, finest)), np.zeros(len(finest))

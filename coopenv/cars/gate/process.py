@@ -157,7 +157,8 @@ def run(link: GateConnection) -> None:
 def gate_deployment(car: str, path: Path | None, connect: str | None = None, off_board: bool = False) -> Deployment:
     """Return a deployment, without a file the usual one, whose network is that of a car's gate: the car's own router.
 
-    `off_board` allows a router that is not on this computer, where neutral gets lost with the link.
+    An endpoint takes the place of the file's. `off_board` allows a router that is not on this computer, where neutral
+    gets lost with the link.
 
     Raises:
         CoopenvError: the name is none, the file cannot be read, or knows no such car; an endpoint is none, or not on

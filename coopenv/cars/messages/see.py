@@ -40,7 +40,7 @@ def next_message(transport: Transport, topic: str, kind: str, patience: float) -
 
 
 def published_calibration(car: str, profile: CarProfile, transport: Transport, patience: float) -> Calibration:
-    """Return the calibration that a car's camera publishes. Raises CoopenvError: none for s, or it cannot be read."""
+    """Return the calibration that a car's camera publishes. Raises CoopenvError: none comes in s, or none of use."""
     topic = profile.topic_of(car, Role.CAMERA_INFO)
     info = next_message(transport, topic, profile.topics[Role.CAMERA_INFO].type, patience)
     if info is None:
