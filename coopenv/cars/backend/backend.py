@@ -38,7 +38,6 @@ from coopenv.sources.base import EPISODE_OVER, Capabilities, Command, Health, Ve
 EXPECTED = ("reset", "closed", EPISODE_OVER)
 """Reasons to stop that are no emergency."""
 
-
 FIRST_MESSAGES_TIME = 3.0  # s to wait for first messages at the first reset
 CAMERA_INFO_TIME = 1.5  # s to wait for the calibration of a camera; some publish none
 READY_TIME = 2.0  # s to wait until all conditions of arming hold at once; cars publish theirs once a second

@@ -328,7 +328,6 @@ BYPASSED = (
     "docker/car-zenoh.json5 (docs/cars_safety.md#ways-around-the-gate)"
 )
 
-
 UNTRIED = "has no access rules: past the gate, any of its programs can command the wheels; arming cannot try that"
 """Warning for networks other than Zenoh."""
 

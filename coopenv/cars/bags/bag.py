@@ -35,7 +35,6 @@ LONGEST_GAP = 600.0  # s without any message that is needed
 OFF = 0.1
 """Share by which the rate of a camera may differ from the environment's without a warning."""
 
-
 ENDLESS = {
     "termination.arrival": False,
     "termination.collision": False,

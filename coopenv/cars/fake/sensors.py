@@ -29,7 +29,6 @@ TRUTH_RATE, FILTER_RATE = 100.0, 20.0
 LEADER_RATE, CONDITION_RATE = 60.0, 5.0
 """Hz: motion capture, own filter; poses of a moving landmark, conditions of a car."""
 
-
 GRAVITY = 9.81  # m/s^2
 FULL = 0.9  # share of the battery that is left
 STANDING = {"connected": True, "armed": True, "manual_input": True, "mode": "MANUAL", "system_status": 4}

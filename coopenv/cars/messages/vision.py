@@ -139,7 +139,6 @@ def opencv() -> Any:
 FORMATS = {"JPEG": b"\xff\xd8\xff", "PNG": b"\x89PNG\r\n\x1a\n"}
 """First bytes of the compressed images that are decoded, as ROS has no others."""
 
-
 ENCODINGS = {
     **dict.fromkeys(("mono8", "8UC1"), (1, "u1", "GRAY2{}")),
     **dict.fromkeys(("mono16", "16UC1"), (1, "u2", "GRAY2{}")),
