@@ -12,12 +12,13 @@ import time
 import warnings
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Unpack
 
-from coopenv.base.errors import DataError, DataWarning, OutputError
+from coopenv.base.errors import CoopenvError, DataError, DataWarning, OutputError
 from coopenv.base.files import writing
-from coopenv.base.installation import install_command, needing, version
+from coopenv.base.installation import install_command, version
 from coopenv.cars.backend.assembler import Assembler, Intake
 from coopenv.cars.backend.binding import OPTIONS, Binding, bind, reset_options
 from coopenv.cars.backend.sources import DRIVE_METADATA
@@ -30,10 +31,7 @@ from coopenv.scenario import parse_scenario
 from coopenv.scenario.files import override
 from coopenv.scenario.own_terms import without_own_terms
 from coopenv.sources.base import Capabilities, TickGenerator, TickStream
-from coopenv.sources.mcap_format import CUT_OFF, RosLog, reading
-
-with needing(f"drives of cars need an extra: {install_command('svea')}"):
-    from coopenv.sources.mcap_container import Container
+from coopenv.sources.mcap_format import CUT_OFF, RosLog, codec, reading
 
 FORMAT = "coopenv drive 1"
 ATTACHMENT = "drive.json"
@@ -50,8 +48,12 @@ class DriveRecorder:
     def __init__(self, path: Path, head: bytes, types: Mapping[str, str]) -> None:
         """Open a new file; `head` is of fleet and environment, for the replay, and `types` of every topic.
 
-        Raises OutputError: the file is there, or cannot be written.
+        Raises:
+            OutputError: the file is there, or cannot be written.
+            CoopenvError: the extra is not installed.
         """
+        if find_spec("mcap") is None:
+            raise CoopenvError(f"recording cars needs an extra: {install_command('svea')}")
         if path.suffix != ".mcap":
             raise OutputError(f"{path}: the name must end in .mcap")
         if path.exists():
@@ -159,8 +161,11 @@ class Drive(TickGenerator):
 
         Raises:
             DataError: it is none, or is damaged.
-            CoopenvError: an override is not valid.
+            CoopenvError: an override is not valid, or the extra is missing.
         """
+        codec()  # its error names the missing extra
+        from coopenv.sources.mcap_container import Container
+
         self._where = str(path)
         with reading(self._where):
             container = Container(Path(path), truncated=True)
