@@ -48,9 +48,12 @@ class _Car:
         self.exposed = 0  # when the last frame was; the begin of the episode before there is one
 
     def advance(self, now: int, half: int) -> Detections | None:
-        """Move the moment to that of the next frame by the time of the tick, or on with the clock; return the frame.
+        """Move the moment to that of the next frame, or on with the clock; return the frame.
 
-        On with the clock is `half` a period, ns, behind it, so that a frame that comes too late is after the moment.
+        Args:
+            now: time of the tick.
+            half: ns of half a period more behind the clock, so that the frame that comes too late for this tick is
+                after the moment.
         """
         if (taken := self.frames.take(self.moment, now)) is None:
             self.moment = max(self.moment, now - self.lag - half)

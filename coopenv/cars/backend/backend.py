@@ -378,9 +378,15 @@ def open_cars(name: str, overrides: Mapping[str, Any], deployment: str | Path | 
 
 
 def scenario_of(deployment: Deployment, environment: str | None, overrides: Mapping[str, Any]) -> Scenario:
-    """Return the environment of a deployment, or another one by name or path, with the deployment's overrides and more.
+    """Return the environment of a deployment.
 
-    Raises CoopenvError: there is no such environment, or an override is not valid.
+    Args:
+        deployment: names it, and has overrides of it.
+        environment: name or path in place of its own.
+        overrides: after the deployment's.
+
+    Raises:
+        CoopenvError: there is no such environment, or an override is not valid.
     """
     own, file = deployment.environment, deployment.file.name
     if own.endswith(".toml"):

@@ -59,10 +59,16 @@ def bind(
     profile: CarProfile = SVEA,
     calibrated: bool = True,
 ) -> Binding:
-    """Return the binding of cars, and of the numbers of landmarks' markers, to their scenario.
+    """Return the binding.
 
-    The vehicle of the car `only` alone is estimated here; None: all are. If `calibrated`, the environment needs the
-    calibration of every camera, see `check_calibrated`. Errors begin with the file's name, `where`.
+    Args:
+        scenario: scenario of the cars as vehicles.
+        cars: the fleet.
+        markers: numbers of the markers of landmarks, by name.
+        where: name of the file, for errors.
+        only: the car whose vehicle alone is estimated here; None: all are.
+        profile: make of the cars.
+        calibrated: the environment needs the calibration of every camera, see `check_calibrated`.
 
     Raises:
         CoopenvError: a name is not of the scenario, a vehicle has no car, or the camera has no calibration; the

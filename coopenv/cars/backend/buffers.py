@@ -218,9 +218,13 @@ class StatusBoard:
             self._begun, self._happened = dict(self._conditions), {}
 
     def obstacles(self, car: str, least: float, used: Calibration, right: Correction | None = None) -> Iterator[str]:
-        """Yield reasons not to arm a car by its conditions; `least` is the share of its battery that it needs.
+        """Yield reasons not to arm a car by its conditions.
 
-        Its camera's own calibration, with constants that take its place (None: none do), has to agree with that `used`.
+        Args:
+            car: its name.
+            least: share of its battery that it needs.
+            used: calibration of its camera, which its own has to agree with.
+            right: constants that take the place of its own (None: none do).
         """
         remote, state = self._conditions[car, Role.REMOTE].status, self._conditions[car, Role.STATE].status
         battery = self._conditions[car, Role.BATTERY].status.battery

@@ -46,7 +46,12 @@ class DriveRecorder:
     """Writes a drive into a file, in a thread of its own, so that no tick waits for the disk."""
 
     def __init__(self, path: Path, head: bytes, types: Mapping[str, str]) -> None:
-        """Open a new file; `head` is of fleet and environment, for the replay, and `types` of every topic.
+        """Open a file.
+
+        Args:
+            path: of the file, which must not be there.
+            head: fleet and environment, for the replay.
+            types: type of every topic.
 
         Raises:
             OutputError: the file is there, or cannot be written.
@@ -157,7 +162,11 @@ class Drive(TickGenerator):
     options = OPTIONS
 
     def __init__(self, path: str | Path, overrides: Mapping[str, Any] | None = None) -> None:
-        """Open a file that `coopenv svea run --record` has written; overrides are dotted keys of its environment.
+        """Open a file that `coopenv svea run --record` has written.
+
+        Args:
+            path: the file.
+            overrides: dotted keys of its environment, for example another observer's name.
 
         Raises:
             DataError: it is none, or is damaged.

@@ -49,7 +49,15 @@ def value_reader(
     calibrations: Mapping[str, Calibration],
     unknown: Counter[int],
 ) -> ReadValue:
-    """Return the reader of messages by the map; detections of markers that are not in it are counted in `unknown`."""
+    """Return the reader of messages by the map.
+
+    Args:
+        given: the map.
+        binding: the cars and their vehicles.
+        chosen: the topics that are read.
+        calibrations: of the cars' cameras.
+        unknown: counts detections of markers that are not in the map.
+    """
     known, turning = frozenset(binding.targets), {entry.car for entry in chosen if entry.role is Role.IMU}
     right = Correction()
     frames, here = {Role.TRUTH: given.frames.truth or given.frames.map}, MapFrame()
@@ -198,9 +206,15 @@ class BagLog:
 
 
 def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog:
-    """Read the bags of one recording, for example one per car.
+    """Read bags.
 
-    Raises DataError: one cannot be read, something that is needed is missing or has not one message of use.
+    Args:
+        paths: of one recording, for example one per car.
+        given: the map of topics.
+        binding: the cars and their vehicles.
+
+    Raises:
+        DataError: one cannot be read, something that is needed is missing or has not one message of use.
     """
     where = ", ".join(str(path) for path in paths)
     with ExitStack() as stack:

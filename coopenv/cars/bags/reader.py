@@ -41,7 +41,11 @@ class ReaderError(ValueError):
 
 
 def in_reader(make: Callable[[], Iterator[Record]], size: int) -> Iterator[Record]:
-    """Yield the records of a generator, which is made and runs in a child process; `size`: bytes of the files.
+    """Yield the records that a generator makes in a child process.
+
+    Args:
+        make: makes the generator, in the child.
+        size: bytes of the files.
 
     Raises:
         ReaderError: the child has crashed, or exceeded its limits.

@@ -69,7 +69,10 @@ def export_bag(recording: Recording, folder: Path, observer: str | None) -> None
 def write_bag(recording: Recording, folder: str | Path, estimates: Run | None = None) -> None:
     """Write a recording as the folder of a ROS 2 bag, metadata and MCAP, with the map of its topics; it is replaced.
 
-    Without a scenario there is no map, and without an observer's estimates no topic `estimate`.
+    Args:
+        recording: of any vehicles; without a scenario there is no map.
+        folder: of the bag.
+        estimates: of an observer on the recording, for the topics `estimate`; None: they are absent.
 
     Raises OutputError: the folder cannot be written.
     """

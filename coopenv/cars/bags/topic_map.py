@@ -268,9 +268,15 @@ class Chosen:
 
 
 def select(given: TopicMap, topics: Mapping[str, str], where: str) -> list[Chosen]:
-    """Return the topics that are read, of a bag with such topics and types, whose name in errors is `where`.
+    """Return the topics that are read.
 
-    Raises DataError: a needed topic is absent, or holds messages that cannot be read in the role of the map.
+    Args:
+        given: the map.
+        topics: type of every topic of the bag.
+        where: names the bag in errors.
+
+    Raises:
+        DataError: a needed topic is absent, or holds messages that cannot be read in the role of the map.
     """
     found: dict[tuple[str, str], Chosen] = {}
     for entry in (entry for car in given.cars for entry in _of_car(given, car, topics, where)):

@@ -45,9 +45,12 @@ class Clocks:
 
 
 def reconcile(files: Sequence[Delays], tolerance: float, stated: Mapping[str, int]) -> Clocks:
-    """Return the corrections of the times of every source and file, by the delays in each.
+    """Return the corrections of the times of every source and file.
 
-    Clocks count as the same up to a tolerance, ns; `stated` is added to the stamps of sources, ns, by the map.
+    Args:
+        files: delays of the sources of each file.
+        tolerance: ns up to which clocks count as the same.
+        stated: ns to add to the stamps of sources, by the map.
     """
     behind = recorders(files)
     found: dict[str, Shift] = {}

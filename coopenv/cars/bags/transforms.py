@@ -104,7 +104,11 @@ def odd_mountings(
 ) -> Iterator[str]:
     """Yield a note for each camera whose mounting in the tree is not that of the environment.
 
-    By car, `frames` are the cameras' optical frames, as messages name them, and `bodies` those that are no `base_link`.
+    Args:
+        tree: of the bag.
+        frames: optical frame of each car's camera, as its messages name it.
+        bodies: frame of each car's body, if that is not `base_link`.
+        cameras: the environment's cameras by car.
     """
     for car, name in frames.items():
         root, mounted = tree.up(frame_name(name), (BASE, bodies[car]))

@@ -132,7 +132,11 @@ def calibrate(drive: CalibrationDrive, truth: bool = True) -> Calibrated:
 def corrected(batch: Batch, given: Fit, tried_most: int = TRIED, least: float = -np.inf) -> Fit:
     """Return the fit with the wrong constants corrected, from one with all as given.
 
-    In each round `tried_most` hypotheses are fitted, those of a linearised gain of at least `least`.
+    Args:
+        batch: the least squares.
+        given: fit with all constants as given.
+        tried_most: hypotheses that are fitted in each round.
+        least: linearised gain at which one is fitted.
     """
     fit, groups = given, hypotheses(batch)
     penalty = 0.5 * log(sum(len(batch.times(c)) for c in range(len(batch.cars))))
@@ -185,8 +189,11 @@ def errors(batch: Batch, fit: Fit) -> Array:
 def wrong(batch: Batch, fit: Fit, error: Array, coarse: float = 1.0) -> tuple[Mask, Mask]:
     """Return which constants are wrong, and which are off, yet within the noise by which the environment draws them.
 
-    Free constants of the fit may be wrong; `error` (G,) are their standard errors. Deviations and standard errors that
-    count as wrong are `coarse` times as large.
+    Args:
+        batch: the least squares.
+        fit: with the constants that may be wrong as free ones.
+        error: (G,) standard errors.
+        coarse: times the deviations and standard errors that count as wrong.
     """
     finest = coarse * np.array([FINEST[kind.unit] for kind in batch.kinds])
     off, drawn = fit.free & (np.abs(fit.x) > np.maximum(coarse * SIGNIFICANT * error, finest)), np.zeros(len(finest))

@@ -149,8 +149,12 @@ def keyframe_poses(batch: Batch, c: int, x: Array) -> Array:
 def solved(drive: CalibrationDrive, truth: bool, begun: Array) -> tuple[Batch, Fit, Array, Array]:
     """Return the batch of a drive, its fit with all markers free, places (L, 3) of markers and starts (C, 3) of cars.
 
-    The sightings of known cars give the first places, and these the first poses of other cars. The first constants of
-    cars are those `begun`, as of `first_constants`; `truth`: whether motion capture counts.
+    The sightings of known cars give the first places, and these the first poses of other cars.
+
+    Args:
+        drive: its cars and markers.
+        truth: whether motion capture counts.
+        begun: the first constants of its cars, as of `first_constants`; those of markers are not read.
     """
     batch = Batch(replace(drive, places=drive.places.copy()), truth)
     x, counted = np.zeros(len(batch.kinds)), known_cars(batch)
@@ -314,7 +318,10 @@ def only(drive: CalibrationDrive, kept: Sequence[int]) -> CalibrationDrive:
 def sorted_markers(batch: Batch, x: Array, numbers: Sequence[int]) -> tuple[dict[str, int], list[int], dict[int, str]]:
     """Return the markers that cars carry, by car, those that stand still, and why others are left out.
 
-    Lines of sight are those of first constants (G,). Numbers of markers are in the order of the drive.
+    Args:
+        batch: of the drive.
+        x: (G,) first constants.
+        numbers: of the markers, in the order of the drive.
     """
     poses, counted = [keyframe_poses(batch, c, x) for c in range(len(batch.cars))], known_cars(batch)
     own: dict[str, int] = {}

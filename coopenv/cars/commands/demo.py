@@ -177,8 +177,12 @@ class Demo:
     def run(self, port: int | None, log: Console, out: Console) -> bool:
         """Start everything, drive, report, and end everything. Return whether the cars drove without being stopped.
 
-        Of a drive that is interrupted what has been driven takes its place, unless an earlier drive stands there. The
-        router in real time has a port (None: a free one).
+        Of a drive that is interrupted what has been driven takes its place, unless an earlier drive stands there.
+
+        Args:
+            port: of the router in real time (None: a free one).
+            log: progress.
+            out: results.
 
         Raises:
             CoopenvError: the extra is missing, a process does not start, the cars cannot be armed, results cannot be

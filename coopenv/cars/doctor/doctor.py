@@ -63,9 +63,12 @@ def treated(finding: Finding, trusted: Collection[str]) -> Finding:
 def examine(
     streams: Streams, trusted: Collection[str] = (), counts: Callable[[CarStreams], bool] = lambda car: True
 ) -> Examined:
-    """Return what is wrong with the streams of all cars that count, but for constants and clocks.
+    """Return what is wrong with the streams of all cars, but for constants and clocks.
 
-    Topics that are trusted, or other subjects of findings, stay unchanged.
+    Args:
+        streams: of a bag or of live cars.
+        trusted: topics, or other subjects of findings, that stay unchanged.
+        counts: whether a car is looked at.
     """
     cars = (streams.car(name) for name in streams.binding.cars)
     return examine_cars([car for car in cars if car.samples and counts(car)], trusted)
@@ -186,9 +189,12 @@ def _mend_of(finding: Finding, car: CarStreams) -> Mend:
 def examine_constants(
     found: Examined, drive_of: Callable[[CarStreams], CalibrationDrive], trusted: Collection[str] = ()
 ) -> list[Finding]:
-    """Return wrong constants of all cars, whose streams are without the known faults, by the drive of each alone.
+    """Return wrong constants of all cars; of cars with a fault that nothing removes they are not looked at.
 
-    Of cars with a fault that nothing removes they are not looked at. Subjects that are trusted stay unchanged.
+    Args:
+        found: the examination of the cars, whose streams are without the faults that are known.
+        drive_of: returns the drive of a car alone.
+        trusted: subjects of findings that stay unchanged.
     """
     constants: list[Finding] = []
     for name, car in found.cars.items():

@@ -102,8 +102,14 @@ def examined(
     What a bag mends is refused here: gate and watchdog use the streams as they come. So is wrong motion capture, by
     which the distances of cars are judged. Poor detections are left out here, too. Other findings stay warnings.
     Contradictions without a known cause are the watchdog's, which compares estimates. From one place many causes look
-    alike, so that cars that have stood are left out. Samples are in the order of their stamps;
-    subjects that are trusted do not count. With `constants`, wrong ones are looked for, too.
+    alike, so that cars that have stood are left out.
+
+    Args:
+        samples: in the order of their stamps.
+        binding: of the fleet.
+        trusted: subjects of findings that do not count.
+        lenses: of the cameras of cars.
+        constants: whether wrong constants are looked for, too.
     """
     roles = {(s.car, s.role) for s in samples if s.role in binding.profile.topics}
     topics = {(car, role): binding.profile.topic_of(car, role) for car, role in roles}

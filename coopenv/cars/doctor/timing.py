@@ -103,7 +103,11 @@ def of_drift(drift: float, topic: str, car: str) -> Iterator[Finding]:
 def of_frames(samples: Sequence[Sample], topic: str, frames: Collection[str], in_the_room: bool) -> Iterator[Finding]:
     """Yield that a twist is in another frame than its `child_frame_id` states.
 
-    Frames are those of positions by motion capture; `in_the_room`: the twist is in one of them, as others show.
+    Args:
+        samples: of a topic.
+        topic: its name.
+        frames: of positions by motion capture.
+        in_the_room: whether the twist is in the frame of positions, as others show.
     """
     if not samples or not (child := samples[0].stated.child_frame):
         return
@@ -123,8 +127,12 @@ def of_timing(
 ) -> Iterator[Finding]:
     """Yield what is wrong with the times of messages, and with the frames that these state.
 
-    Drifts of topics were removed from the tracks; all samples are on one clock. Subjects that are trusted stay
-    unchanged, but of two messages with one stamp only one can be used.
+    Args:
+        tracks: of the topics, without drifts.
+        samples: of all topics, on one clock.
+        drifts: of topics, which were removed.
+        examined: the gate's findings of the topics' values.
+        trusted: subjects of findings that stay unchanged; of two messages with one stamp only one can be used.
     """
     for track in tracks:
         yield from of_duplicates(track.entries, track.chosen.topic)

@@ -20,7 +20,10 @@ def constant_turn_rate(
 ) -> str | None:
     """Return in words what contradicts a turn rate that is the same in all messages of a car; None: nothing does.
 
-    Tracks and sightings are as of `CarStreams`, the latter in the plane; the wheelbase is in m.
+    Args:
+        tracks: of a car, see `coopenv.cars.messages.readings.tracks_of`.
+        sightings: as of `CarStreams.sightings_in_plane`.
+        wheelbase: of the car, m.
     """
     rates = tracks["gyro"]
     if len(rates) < 2 or np.ptp(rates) > 0.0:

@@ -38,7 +38,13 @@ class Process(subprocess.Popen[bytes]):
     """A command of coopenv, which leads a process group of its own."""
 
     def __init__(self, name: str, command: Sequence[str], folder: Path) -> None:
-        """Start `coopenv` with arguments, its output in a folder; the name is for errors."""
+        """Start it.
+
+        Args:
+            name: in errors.
+            command: arguments of `coopenv`.
+            folder: of its output.
+        """
         self.name = name
         self._logs = folder / f"{name}.out", folder / f"{name}.err"
         with held(), self._logs[0].open("w") as out, self._logs[1].open("w") as errors:

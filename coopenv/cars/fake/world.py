@@ -51,11 +51,15 @@ class CarWorld(World):
     """World of one agent. Poses are in the map, from its origin."""
 
     def __init__(self, scenario: Scenario, agent: int, *, frames: bool = False) -> None:
-        """Build it for an agent by its index: a moving landmark or, after the landmarks, a vehicle.
+        """Build it.
 
-        Sight is exact if cameras take frames, which have noise of their own.
+        Args:
+            scenario: scenario of the world.
+            agent: index of the agent that this car is, a moving landmark or, after the landmarks, a vehicle.
+            frames: whether cameras take frames, which have noise of their own: sight is exact.
 
-        Raises CoopenvError: the scenario limits what vehicles keep.
+        Raises:
+            CoopenvError: the scenario limits what vehicles keep.
         """
         if scenario.topology.most_nearby is not None:
             raise CoopenvError("topology.most_nearby: cars keep all; leave it out")

@@ -277,9 +277,12 @@ class AttackOutcome:
 def attack(intruder: Intruder, commands: int) -> Iterator[AttackOutcome]:
     """Attack standing cars with messages of each kind, and yield each outcome; a kind that succeeds is ended.
 
-    At least so many commands go to all cars, of all kinds together.
+    Args:
+        intruder: sends.
+        commands: of all kinds to all cars, at least.
 
-    Raises CoopenvError: a gate is silent, or a car is armed or moves, before any kind.
+    Raises:
+        CoopenvError: a gate is silent, or a car is armed or moves, before any kind.
     """
     kinds = intruder.kinds()
     each = -(-commands // (len(kinds) * len(intruder.cars)))

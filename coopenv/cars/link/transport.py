@@ -235,9 +235,15 @@ def address_of(endpoint: str) -> Address:
 
 
 def trouble_at(address: Address, context: ssl.SSLContext | None, timeout: float) -> str | None:
-    """Try a connection for some s, and return why it fails; None: it does not, or it cannot be tried.
+    """Try a connection: the errors of libraries often lack the reason.
 
-    The errors of libraries often lack the reason.
+    Args:
+        address: where to.
+        context: certificates, for TLS.
+        timeout: s.
+
+    Returns:
+        Why it fails; None: it does not, or it cannot be tried.
     """
     if address.protocol in ("udp", "quic"):
         return None

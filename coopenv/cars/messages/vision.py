@@ -47,10 +47,14 @@ class Calibration:
 
 
 def rays(pixels: Array, calibration: Calibration) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the rays of pixels (m, 2), which count to the right and down from the image's corner.
+    """Return the rays of pixels.
 
-    They are (m, 3) unit vectors in the optical frame, and (m,) which are rays: of pixels in the image that the lens
-    gives.
+    Args:
+        pixels: (m, 2) to the right and down from the image's corner.
+        calibration: of the camera.
+
+    Returns:
+        (m, 3) unit vectors in the optical frame, and (m,) which are rays: of pixels in the image that the lens gives.
     """
     size, focal, centre = (
         np.asarray(v, dtype=np.float64)

@@ -165,7 +165,10 @@ def with_tables(
 def refuse_repeated(cars: Sequence[Car], markers: Mapping[str, int], numbers: tuple[int, int] | None = None) -> None:
     """Refuse a name, vehicle, landmark or marker of two, with a ValueError that names it.
 
-    So are numbers of markers beyond the smallest and largest one that the camera identifies (None: any).
+    Args:
+        cars: a fleet.
+        markers: numbers of the markers of landmarks, by name.
+        numbers: smallest and largest one that the camera identifies (None: any).
     """
     given: dict[str, list[Any]] = {
         "cars: the name": [car.name for car in cars],

@@ -126,7 +126,13 @@ class CalibrationFile(Section):
 def read_calibration(path: Path, where: str, error: type[CoopenvError]) -> dict[str, Any]:
     """Return the tables of a file that `coopenv calibrate` has written.
 
-    Raises CoopenvError: of class `error`; it cannot be read, or is none. The line begins with `where` it is named.
+    Args:
+        path: of the file.
+        where: begin of the error's line: the file and key that name it.
+        error: class of the error.
+
+    Raises:
+        CoopenvError: of class `error`; it cannot be read, or is none.
     """
     found = read_toml(path, error)
     validated(CalibrationFile, json.dumps(found, default=str), where, error)
