@@ -168,8 +168,11 @@ REST = 0.004
 def prepare_fake(path: str | Path, car: str, gate: bool = True, station: str | None = None) -> Callable[..., Fake]:
     """Return the constructor of a fake from a network and further arguments of `Fake`, checked as far as possible.
 
-    Commands count at its gate if they are of the station (None: of the deployment file's `security.identity`). Without
-    a gate the fake obeys ManualControl.
+    Args:
+        path: deployment file.
+        car: its name.
+        gate: use a gate for commands; otherwise the fake obeys ManualControl.
+        station: whose commands count at its gate (None: those of the file's `security.identity`).
 
     Raises:
         CoopenvError: the file or its environment is not valid, the car is unknown, or a key is missing or another's.

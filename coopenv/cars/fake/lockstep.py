@@ -66,9 +66,14 @@ class LockstepFakes:
     """The fake cars of a deployment, with their gates, on a simulated clock that their station moves on."""
 
     def __init__(self, path: str | Path, seed: int = 0) -> None:
-        """Build the cars of a deployment file, whose network does not count here, with a seed as of `Fake`.
+        """Build the cars.
 
-        Raises CoopenvError: the file or its environment is not valid, or its cars are not fakes.
+        Args:
+            path: deployment file; its network does not count here.
+            seed: see `coopenv.cars.fake.car.Fake`.
+
+        Raises:
+            CoopenvError: the file or its environment is not valid, or its cars are not fakes.
         """
         fleet, self._path = fleet_of_fakes(path), path
         self.clock = SimulatedClock()

@@ -155,10 +155,13 @@ def run(link: GateConnection) -> None:
 
 
 def gate_deployment(car: str, path: Path | None, connect: str | None = None, off_board: bool = False) -> Deployment:
-    """Return a deployment, without a file the usual one, whose network is that of a car's gate: the car's own router.
+    """Return a deployment whose network is that of a car's gate: the car's own router.
 
-    An endpoint takes the place of the file's. `off_board` allows a router that is not on this computer, where neutral
-    gets lost with the link.
+    Args:
+        car: its name.
+        path: deployment file; None: the usual settings.
+        connect: endpoint in place of the file's.
+        off_board: allow a router that is not on this computer, where neutral gets lost with the link.
 
     Raises:
         CoopenvError: the name is none, the file cannot be read, or knows no such car; an endpoint is none, or not on
@@ -192,8 +195,12 @@ def prepare_gate(
 ) -> Callable[[Transport, GateClock], GateConnection]:
     """Return the function that connects a car's gate to a network, checked as far as possible without one.
 
-    The identity of the station that may arm and command, the folder of keys, and limits by name are those of the fleet
-    where none are given. Without keys nothing is signed, and any station can drive the car.
+    Args:
+        fleet: the fleet of the car.
+        car: its name.
+        station: identity that may arm and command (None: the fleet's).
+        keys: folder of keys (None: the fleet's; without any nothing is signed, and any station can drive the car).
+        limits: in place of the fleet's, by name; None leaves one as it is.
 
     Raises:
         CoopenvError: a limit is beyond the hardest, or a key is missing or unsafe.

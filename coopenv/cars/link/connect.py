@@ -7,9 +7,11 @@ from coopenv.cars.settings.deployment import Deployment, DeploymentError
 
 
 def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:
-    """Connect to the network of a fleet, within a time for its router, broker or master, s.
+    """Connect to the network of a fleet; topics are the profile's on every kind of network.
 
-    Topics are the profile's on every kind of network.
+    Args:
+        deployment: the network and its certificates.
+        timeout: s to wait for the router, broker or master.
 
     Raises:
         DeploymentError: certificates that cannot be used, or what the kind of network cannot do.

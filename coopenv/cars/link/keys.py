@@ -138,7 +138,11 @@ def make_keys(folder: str | Path, identities: Iterable[str], force: bool = False
 
 
 def load_signer(path: str | Path, identity: str) -> Signer:
-    """Return the signer of an identity by its private file, or by a folder of keys.
+    """Return the signer of an identity.
+
+    Args:
+        path: its private file, or a folder of keys.
+        identity: name of a car or a station.
 
     Raises:
         KeyFileError: the file is missing, no plain file, of another user, open to others, or no key; or in a folder its

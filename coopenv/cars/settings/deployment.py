@@ -385,9 +385,14 @@ class IdentifiedFile(Section):
 
 
 def load_deployment(path: str | Path, connect: str | None = None) -> Deployment:
-    """Read a deployment file; an endpoint takes the place of its `network.connect`.
+    """Read a deployment file.
 
-    Raises DeploymentError: it cannot be read, or one line says which field is not what it must be.
+    Args:
+        path: of the file.
+        connect: endpoint in place of the file's `network.connect`.
+
+    Raises:
+        DeploymentError: it cannot be read, or one line says which field is not what it must be.
     """
     path = Path(path)
     raw = read_toml(path, DeploymentError)
