@@ -538,7 +538,7 @@ def main() -> None:
             found, bag, _ = _opened(change(sound))
             total["sound"] += 1
             total["false alarms"] += bool(found)
-            total["refused without a fault"] += bag is None or bag.is_refused
+            total["refused without a fault"] += bag is None or bool(bag.refused)
             print(f"room {number}: {name}: {found or 'silent'}", flush=True)
         if more:
             continue
@@ -556,7 +556,7 @@ def main() -> None:
             total[("two: " if len(entries) > 1 else "") + verdict] += 1
             total["two: each named"] += len(entries) > 1 and all(hits)
             lines: Any = "" if all(hits) and len(found) == len(hits) else found
-            off = "refused" if bag is None or bag.is_refused else "stated"
+            off = "refused" if bag is None or bool(bag.refused) else "stated"
             treatments = () if bag is None else (finding.treatment for finding in bag.log.findings)
             if bag is not None and all(t in (Treatment.MENDED, Treatment.LEFT_OUT) for t in treatments):
                 worse = rmse(bag, clean) / best

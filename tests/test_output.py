@@ -40,7 +40,7 @@ class Reset:
 """
 SHORT = ["--set", "horizon=0.5"]
 EVALUATE = ["evaluate", "facade", *SHORT, "--worlds", "2", "--out", "out", "--agents"]
-WATCH = ["watch", "--env", "facade", *SHORT, "--out", "film"]
+FILM = ["film", "facade", *SHORT, "--out", "film.gif", "--agent"]
 
 
 @pytest.fixture(autouse=True)
@@ -68,8 +68,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ([*EVALUATE, ","], "--agents ,: names no agent"),
         ([*EVALUATE, "peek", "--set", "camera.range=nan"], "camera.range: Input should be a finite number, got nan"),
         ([*EVALUATE, "peek", "--worlds", "99999999999"], "Invalid value for '--worlds'"),
-        ([*WATCH, "route_follower", "--out", "file"], "cannot write to file: it is not a folder"),
-        (["watch", "route_follower", "--speed", "nan"], "Invalid value for '--speed'"),
+        ([*FILM, "route_follower", "--out", "nowhere/film.gif"], "folder nowhere does not exist"),
+        ([*FILM, "route_follower", "--speed", "nan"], "Invalid value for '--speed'"),
         (["run", "facade", "--set", "seed=3"], "seed: unknown key; allowed: action, backend,"),
         (["bench", "observers", "overtaking", "--observers", ""], "unknown observer ''; known: "),
         (["bench", "observers", "overtaking", "--seeds", "1000", "--out", "file"], "cannot write to file"),
@@ -116,7 +116,7 @@ def test_a_mistake_is_one_line_and_nothing_is_left(
 
 
 @pytest.mark.skipif(not os.path.ismount("/proc"), reason="needs a folder that nobody can write to")
-@pytest.mark.parametrize("arguments", [[*EVALUATE, "peek"], [*WATCH, "peek"]])
+@pytest.mark.parametrize("arguments", [[*EVALUATE, "peek"], [*FILM, "peek"]])
 def test_a_folder_that_cannot_be_made(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*arguments, "--out", "/proc/nobody"]) == 2
     assert "error: cannot write to /proc/nobody" in capsys.readouterr().err

@@ -24,6 +24,8 @@ BASELINES = ("route_follower", "peek", "look_ahead")
 PAGE_FILE = "README.md"
 BASE_ARM = "plain"
 """The arm that others are compared with."""
+CHANGES = {"e95_m": "e95", "e50_m": "e50", "travel_time_s": "travel time"}
+"""Metrics whose changes stand on the page, and their names there."""
 
 
 def is_reported(agent: str, plans: Sequence[TrainingPlan], folder: Path) -> bool:
@@ -100,7 +102,7 @@ def write_overview(agents: Iterable[TrainingPlan], folder: Path, judge: Judge) -
         against = {name: judge.against(environment, best[name], best[str(base)]) for name in others}
         relative = {name: changes(found, cards.OVERVIEW) for name, found in against.items()}
         sections[environment] = {"cards": found, "base": base, "against": relative, "table": _table(environment, found)}
-    known = {"percent": percent, "changes": cards.changes_text, "medians": medians}
+    known = {"percent": percent, "changes": changes_text, "medians": medians}
     replace_text(folder / PAGE_FILE, rendered("agents.md.j2", "benchmarks.learning", "", sections=sections, **known))
 
 
@@ -109,15 +111,25 @@ def _table(environment: str, found: Mapping[str, Mapping[str, Any]]) -> str:
     *_, newest = found.values()
     rows: list[tuple[Any, ...]] = [((name,), results, "") for name, results in newest["study"]["beside"].items()]
     for name, card in found.items():
-        errors = ", ".join(f"{100 * error:.1f}" for error in cards.seeds_of(card, "e95_m"))
+        errors = ", ".join(f"{100 * error:.1f}" for error in seeds_of(card, "e95_m"))
         rows.append(((f"[`{name}`]({name}/card.md)",), card["environments"][environment]["results"], errors))
     return cards.figures_table(("agent",), rows, cards.OVERVIEW, ("e95 of seeds [cm]",))
 
 
+def seeds_of(card: Mapping[str, Any], metric: str) -> list[float]:
+    """Return a figure of every seed of a study."""
+    return [entry["results"][metric]["mean"] for entry in card["study"]["seeds"].values()]
+
+
+def changes_text(found: Mapping[str, Any], metrics: Iterable[str]) -> str:
+    """Return relative differences of a card, with their intervals, by the names of the metrics."""
+    return ", ".join(f"{CHANGES[metric]} {percent(found[metric])}" for metric in metrics)
+
+
 def medians(card: Mapping[str, Any], base: Mapping[str, Any]) -> str:
     """Return the difference between the errors of the median seeds of two studies, in words."""
-    shares = {m: median(cards.seeds_of(card, m)) / median(cards.seeds_of(base, m)) - 1 for m in ("e50_m", "e95_m")}
-    return ", ".join(f"{cards.CHANGES[metric]} {100 * share:+.0f} %" for metric, share in shares.items())
+    shares = {m: median(seeds_of(card, m)) / median(seeds_of(base, m)) - 1 for m in ("e50_m", "e95_m")}
+    return ", ".join(f"{CHANGES[metric]} {100 * share:+.0f} %" for metric, share in shares.items())
 
 
 def results_table(study: Study, folder: Path) -> Table:
@@ -129,7 +141,7 @@ def results_table(study: Study, folder: Path) -> Table:
         card = cards.read(folder / agent)
         if "study" not in card:
             continue
-        results, errors = card["environments"][plans[0].environment]["results"], cards.seeds_of(card, "e95_m")
+        results, errors = card["environments"][plans[0].environment]["results"], seeds_of(card, "e95_m")
         shown = [cell(results[m], factor).replace(" ", "\n", 1) for m, (_, factor) in columns.items()]
         table.add(agent, str(len(errors)), *shown, " ".join(f"{100 * error:.0f}" for error in errors))
     return table

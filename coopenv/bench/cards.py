@@ -16,10 +16,6 @@ from coopenv.policies.loader import CARD_FILES
 from coopenv.report.table import markdown
 from coopenv.report.templates import rendered
 
-CHANGES = {"e95_m": "e95", "e50_m": "e50", "travel_time_s": "travel time"}
-"""Metrics whose changes stand on cards, and their names there."""
-
-
 JSON_FILE, TEXT_FILE = CARD_FILES
 
 
@@ -93,9 +89,7 @@ def save(folder: Path, description: str, card: Mapping[str, Any]) -> Path:
         results=figures_table(("environment", "worlds"), worlds),
         trained="" if study is None else _study_table(study),
         explanations=EXPLANATIONS,
-        errors=sorted(seeds_of(card, "e95_m")) if study else [],
-        within=WITHIN,
-        changes=changes_text,
+        percent=percent,
     )
     replace_text(folder / TEXT_FILE, text)
     return folder / TEXT_FILE
@@ -113,8 +107,6 @@ def _study_table(study: Mapping[str, Any]) -> str:
 
 
 OVERVIEW = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m")
-WITHIN = 0.15
-"""Seeds whose e95 is at most so much above the best one's count as alike."""
 
 
 def figures_table(
@@ -134,13 +126,3 @@ def figures_table(
     heads = [*names, *(COLUMNS[metric][0].strip().replace("\n", " ") for metric in metrics), *last]
     cells = ((first, [cell(found[m], COLUMNS[m][1]) for m in metrics], rest) for first, found, *rest in rows)
     return markdown(heads, [(*first, *shown, *rest) for first, shown, rest in cells])
-
-
-def seeds_of(card: Mapping[str, Any], metric: str) -> list[float]:
-    """Return a figure of every seed of a study."""
-    return [entry["results"][metric]["mean"] for entry in card["study"]["seeds"].values()]
-
-
-def changes_text(found: Mapping[str, Any], metrics: Iterable[str]) -> str:
-    """Return relative differences of a card, with their intervals, by the names of the metrics."""
-    return ", ".join(f"{CHANGES[metric]} {percent(found[metric])}" for metric in metrics)

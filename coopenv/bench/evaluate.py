@@ -5,7 +5,6 @@ Figures are the error along the way, time against error, and where drivers looke
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +14,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from rich.console import Console
 
-from coopenv.api.engine import Engine
 from coopenv.base.errors import explained
 from coopenv.base.files import check_new, replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import names_of, version, versions
 from coopenv.bench.contest import Contest
 from coopenv.bench.evaluation import KINDS, Evaluation, evaluated
-from coopenv.episode import Episode, Origin
+from coopenv.episode import Episode
 from coopenv.evaluation import METRICS, held_out_seeds
 from coopenv.evaluation.episodes import Episodes
 from coopenv.evaluation.metrics import SCORE, Quantile, interval, resamples
@@ -31,8 +29,9 @@ from coopenv.runs import films
 from coopenv.runs.command import REPLAY_FILE
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.films import Shot, video_path
-from coopenv.runs.scenes import frame_stride, scene_of, write_page
+from coopenv.runs.scenes import frame_stride, played_scene, write_page
 from coopenv.scenario import ScenarioLike
+from coopenv.sources.sources import simulation_of
 from coopenv.viz import FORMATS, style
 from coopenv.viz.style import INK, NORMAL, SMALL
 from coopenv.viz.topview import TopView
@@ -260,12 +259,11 @@ COLUMNS = 3
 
 def scenes_of(evaluation: Evaluation, log: Console) -> list[Episode]:
     """Return every driver's episode in the first world of an evaluation."""
-    seed, scenes = held_out_seeds(evaluation.block, evaluation.worlds)[0], []
-    for entrant in evaluation.entrants:
-        source = Origin.of(evaluation.environment, entrant.scenario, policy=entrant.name, seed=seed)
-        with closing(Engine(entrant.scenario)) as engine, Progress(log, f"replay of {entrant.name}", 1.0) as progress:
-            scenes.append(scene_of(engine, source, entrant.policy, progress.update))
-    return scenes
+    seed = held_out_seeds(evaluation.block, evaluation.worlds)[0]
+    return [
+        played_scene(simulation_of(each.scenario), evaluation.environment, log, seed, each.policy, each.name)
+        for each in evaluation.entrants
+    ]
 
 
 def write_film(scenes: Sequence[Episode], folder: Path, log: Console) -> None:

@@ -25,7 +25,7 @@ from coopenv.cli.evaluate import evaluate
 from coopenv.cli.plugins import Extended
 from coopenv.cli.run import export, figures, record, run
 from coopenv.cli.train import dataset, train
-from coopenv.cli.view import film, view, watch
+from coopenv.cli.view import film, view
 
 UsageError: Any = typer.BadParameter.__base__  # raised for every mistake in the options; it has no public name
 INTERRUPTED, PIPE_CLOSED = 130, 141  # exit statuses, 128 plus the number of the signal
@@ -148,7 +148,7 @@ app.command("compare", hidden=True)(bench_observers)  # its name in Python
 app.command(rich_help_panel=COMPARE)(evaluate)
 app.command(rich_help_panel=TRAIN)(train)
 app.command(rich_help_panel=TRAIN)(dataset)
-for command in (view, film, watch):
+for command in (view, film):
     app.command(rich_help_panel=VIEW)(command)
 
 

@@ -44,7 +44,7 @@ def bench_seeds(
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObserverOptions:
+class ObserverOptions(options.DataOptions):
     """Options of `coopenv bench observers`."""
 
     source: options.Source
@@ -99,14 +99,7 @@ class ObserverOptions:
     memory: Annotated[
         float | None, typer.Option(min=1, help="Memory beyond which an observer is ended, MiB (default: 8192).")
     ] = None
-    data: options.DataFolder = None
-    topics: options.TopicMap = None
-    start: options.From = None
-    until: options.Until = None
-    robots: options.Robots = None
-    trust: options.Trust = None
     basin: Annotated[int, typer.Option(min=0, help="Random initial estimates for maps of the basins.")] = 0
-    overrides: options.Overrides = None
     steady_from: options.SteadyFrom = None
     windows: Annotated[
         str | None,
@@ -133,11 +126,9 @@ class ObserverOptions:
         """Return the comparison, everything in it checked."""
         from coopenv.bench.observers.comparison import SEEDS, Plan
         from coopenv.bench.observers.sources import find_source, with_sensor_sets
-        from coopenv.sources.selection import Selection
 
-        changes = options.parse_overrides(self.overrides)
-        chosen = Selection.of(self.start, self.until, self.robots, self.trust or ())
-        source = find_source(self.source, changes, self.data, self.topics, self.faults or (), self.policy, chosen)
+        faults, chosen = self.faults or (), self.selection
+        source = find_source(self.source, self.changes, self.data, self.topics, faults, self.policy, chosen)
         source = with_sensor_sets(source) if self.sensors else source
         seeds = range(self.first, self.first + (self.seeds or SEEDS)) if self.seeds or self.first else None
         return Plan.of(self.names, source, seeds, self.variants, self.steady_from, self.windows)

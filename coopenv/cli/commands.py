@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import shlex
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import fields
 from enum import Enum
 from typing import Any, TypeVar, get_type_hints
@@ -74,20 +74,23 @@ def group(words: str) -> typer.Typer:
 def command(function: Callable[[Options], None]) -> Callable[..., None]:
     """Return a command whose parameters are the fields of a record of options, the only argument of the function.
 
-    In the help a record's own options come before those that it inherits.
+    In the help, and in `command_text`, a record's own options come before those that it inherits.
     """
     [record] = [kind for name, kind in get_type_hints(function).items() if name != "return"]
-    kinds = get_type_hints(record, include_extras=True)
-    own = [vars(kind).get("__annotations__", {}) for kind in record.__mro__]
-    parameters = inspect.signature(record).parameters.values()
-    own_first = sorted(parameters, key=lambda p: next(depth for depth, names in enumerate(own) if p.name in names))
+    kinds, parameters = get_type_hints(record, include_extras=True), inspect.signature(record).parameters.values()
 
     def run(**given: Any) -> None:
         function(record(**given))
 
     run.__name__, run.__doc__ = function.__name__, function.__doc__
-    run.__signature__ = inspect.Signature([p.replace(annotation=kinds[p.name]) for p in own_first])  # type: ignore[attr-defined]
+    run.__signature__ = inspect.Signature([p.replace(annotation=kinds[p.name]) for p in own_first(record, parameters)])  # type: ignore[attr-defined]
     return run
+
+
+def own_first(record: type, members: Iterable[Any]) -> list[Any]:
+    """Return fields or parameters of a record of options, its own before those that it inherits."""
+    own = [vars(kind).get("__annotations__", {}) for kind in record.__mro__]
+    return sorted(members, key=lambda one: next(depth for depth, names in enumerate(own) if one.name in names))
 
 
 def command_text(words: str, given: Any, leave_out: Collection[str] = ()) -> str:
@@ -102,7 +105,7 @@ def command_text(words: str, given: Any, leave_out: Collection[str] = ()) -> str
     """
     arguments, named = [], []
     kinds = get_type_hints(type(given), include_extras=True)
-    for field in fields(given):
+    for field in own_first(type(given), fields(given)):
         value = getattr(given, field.name)
         if field.name in leave_out or (not value and value == field.default):
             continue

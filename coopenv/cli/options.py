@@ -135,13 +135,11 @@ SteadyFrom = Annotated[
 
 
 @dataclass(frozen=True, kw_only=True)
-class SourceOptions:
-    """Source to simulate, replay or read."""
+class DataOptions:
+    """Overrides of a scenario, and where and which part of recorded data is used."""
 
-    environment: Source
     overrides: Overrides = None
     data: DataFolder = None
-    variant: Variant = None
     topics: TopicMap = None
     start: From = None
     until: Until = None
@@ -156,14 +154,22 @@ class SourceOptions:
         return Selection.of(self.start, self.until, self.robots, self.trust or ())
 
     @property
-    def files(self) -> dict[str, Any]:
-        """Options of recorded data, as for `open_backend`."""
-        return {"data": self.data, "variant": self.variant, "topics": self.topics}
-
-    @property
     def changes(self) -> dict[str, Any]:
         """The overrides of the scenario, dotted key to value."""
         return parse_overrides(self.overrides)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceOptions(DataOptions):
+    """Source to simulate, replay or read."""
+
+    environment: Source
+    variant: Variant = None
+
+    @property
+    def files(self) -> dict[str, Any]:
+        """Options of recorded data, as for `open_backend`."""
+        return {"data": self.data, "variant": self.variant, "topics": self.topics}
 
     def open(self) -> Backend:
         """Return the source of ticks."""

@@ -1,4 +1,4 @@
-"""`coopenv view`, `film` and `watch`."""
+"""`coopenv view` and `film`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -300,52 +300,3 @@ def view(given: ViewOptions) -> None:
             viewer.run()
     finally:
         reel.close()
-
-
-def watch(
-    agent: Annotated[
-        str,
-        typer.Argument(
-            metavar="AGENT",
-            help="Name of an agent, its folder, or where its class stands, mine.py:Mine or package.module:Mine.",
-            autocompletion=arguments.agents,
-            callback=arguments.known_agents,
-        ),
-    ],
-    environment: Annotated[
-        str | None,
-        typer.Option(
-            "--env",
-            help="Name or TOML file of the environment (default: the first that the agent was made for).",
-            **arguments.ENVIRONMENT,
-        ),
-    ] = None,
-    seed: options.Seed = 0,
-    overrides: options.Overrides = None,
-    speed: Annotated[float, typer.Option(min=0.01, help="Times real time.")] = 1.0,
-    out: Annotated[Path | None, typer.Option(help="Folder for a film, in place of the window.")] = None,
-) -> None:
-    """Watch an agent drive, in a window or as a film."""
-    from coopenv.policies import find_agent
-
-    found, log = find_agent(agent), options.console(stderr=True)
-    name = environment or next(iter(found.environments), None)
-    if name is None:
-        raise CoopenvError(f"{agent} names no environment that it was made for; name one with --env")
-    scenario = options.load(name, options.parse_overrides(overrides))
-    from coopenv.base.files import replacing_folder
-    from coopenv.runs import live
-    from coopenv.runs.console import Progress, note_overwritten
-    from coopenv.runs.films import VIDEO_FILES, video_path, write_pictures
-
-    policy = found.policy(scenario)
-    if out is None:
-        stage = live.watch(scenario, policy, seed, log, speed=speed)
-    else:
-        stage = live.LiveWorld(scenario, log)
-        note_overwritten(out, VIDEO_FILES, log)
-        with replacing_folder(out, VIDEO_FILES) as folder, Progress(log, f"filming {video_path(folder).name}"):
-            fps = scenario.rates.camera / stage.stride
-            write_pictures(video_path(folder), fps, stage.pictures(policy, seed))
-    for line in stage.outcomes():
-        options.console().print(line, soft_wrap=True)

@@ -62,6 +62,8 @@ class NetworkCard(Section):
     """Between which values nearly all entries of a field lay in training, by its name."""
     right_of_way: bool = False
     """Actions keep to the rule `RightOfWay`."""
+    alone: str | None = None
+    """Agent that drives vehicles that receive nothing, see `Alone`."""
 
 
 class AgentCard(Section):

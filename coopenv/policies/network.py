@@ -14,6 +14,7 @@ from safetensors.numpy import load
 
 from coopenv.api.terms.layout import Layout, observation_layout, settings_of_meaning
 from coopenv.base.errors import AgentWarning, CoopenvError
+from coopenv.policies.alone import Alone
 from coopenv.policies.loader import NetworkCard, NetworkColumn
 from coopenv.policies.look_ahead import LookAhead
 from coopenv.scenario import Scenario
@@ -116,14 +117,15 @@ class Network:
         self._name, self._seen, self._rows = folder.resolve().name, dict(network.seen), 0
         self._places = {name: slice(observation[name].start, observation[name].stop) for name in self._seen}
         self._outside = dict.fromkeys(self._seen, 0.0)
-        self._rule = RightOfWay(scenario) if network.right_of_way else None
-        self.agents = self._rule.agents if self._rule else []
+        self._rules: list[RightOfWay | Alone] = [RightOfWay(scenario)] if network.right_of_way else []
+        self._rules += [Alone(scenario, network.alone)] if network.alone else []
+        self.agents = next((rule.agents for rule in self._rules if rule.agents), [])
         """Names of the vehicles in the order of rows, where a rule needs the rows of all."""
 
     def reset(self, mask: np.ndarray) -> None:
         """Begin new episodes in the rows of a mask."""
-        if self._rule:
-            self._rule.reset(mask)
+        for rule in self._rules:
+            rule.reset(mask)
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return the actions, (rows, A) in [-1, 1], for flat observations, (rows, D)."""
@@ -136,7 +138,9 @@ class Network:
             values = np.tanh(values @ weight + bias)
         weight, bias = self._layers[-1]
         actions = np.asarray(np.clip(values @ weight + bias, -1.0, 1.0))
-        return self._rule(np.asarray(observations, dtype=np.float32), actions) if self._rule else actions
+        for rule in self._rules:
+            actions = rule(np.asarray(observations, dtype=np.float32), actions)
+        return actions
 
     def _compare_with_training(self, observations: np.ndarray) -> None:
         """Warn, once, where many entries of a field lie beyond those of the training."""

@@ -1,89 +1,20 @@
-"""Episodes that are watched while they run: in a window, or as frames of the live view."""
+"""Episodes that are watched while they run, as frames of the live view."""
 
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-import numpy as np
-from rich.console import Console
-
-from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError, listed, suggest
 from coopenv.episode import Episode, Frame, Origin
 from coopenv.evaluation.episodes import play
 from coopenv.observers.registry import available_names
 from coopenv.policies import Policy
-from coopenv.runs.console import compile_notice
 from coopenv.runs.recorder import source_of
-from coopenv.runs.scenes import MAX_FPS, frame_stride
+from coopenv.runs.scenes import MAX_FPS
 from coopenv.scenario import Scenario
 from coopenv.sources.base import Backend
 from coopenv.viz.stage import vehicle_mark
-from coopenv.viz.topview import PictureWindow, TopView
-from coopenv.viz.topview_ground import HEIGHT, WIDTH
 from coopenv.viz.web_panel import Abilities
-
-
-class LiveWorld:
-    """One world, drawn as it runs."""
-
-    def __init__(self, scenario: Scenario, log: Console) -> None:
-        self.scenario, self.engine = scenario, Engine(scenario)
-        self.stride = frame_stride(scenario)
-        """Camera ticks between pictures."""
-        self._view = TopView(self.engine.backend.scenario)  # which may know of roads
-        with compile_notice(log):
-            self.engine.load()
-
-    def pictures(self, policy: Policy, seed: int) -> Iterator[np.ndarray]:
-        """Play an episode and yield its pictures; the last one is of the end."""
-        for tick in play(self.engine, [seed], self.scenario.horizon_ticks, policy, to_the_end=False):
-            if tick % self.stride == 0:
-                yield self._view.draw(self.engine)
-        yield self._view.draw(self.engine)
-
-    def start(self, seed: int, window: PictureWindow) -> None:
-        """Show the start of an episode."""
-        self.engine.reset([seed])
-        window.show(self._view.draw(self.engine))
-
-    def run(self, policy: Policy, seed: int, window: PictureWindow, speed: float, going: Callable[[], bool]) -> None:
-        """Show an episode at a multiple of real time while `going` returns True."""
-        begin, period = time.monotonic(), self.stride / self.scenario.rates.camera / speed
-        for number, picture in enumerate(self.pictures(policy, seed), start=1):
-            window.show(picture)
-            if not going():
-                return
-            time.sleep(max(0.0, begin + number * period - time.monotonic()))
-
-    def outcomes(self) -> list[str]:
-        """Return a line per vehicle: how it has ended so far, and how well it knows its place."""
-        words, errors = outcome_words(self.scenario), self.engine.view("position_error")[0].tolist()
-        ended = self.engine.view("ended")[0].tolist()
-        return [
-            f"{name}: {words[outcome]}, position error {error:.3f} m"
-            for name, outcome, error in zip(self.scenario.vehicle_names, ended, errors, strict=True)
-        ]
-
-
-def watch(
-    scenario: Scenario, policy: Policy, seed: int, log: Console, window: PictureWindow | None = None, speed: float = 1.0
-) -> LiveWorld:
-    """Show an episode in a window until it ends or the window is closed, at a multiple of real time.
-
-    Raises:
-        CoopenvError: there is no display.
-    """
-    if window is None:
-        window = PictureWindow(scenario.title)
-        window.show(np.full((HEIGHT, WIDTH, 3), 255, np.uint8))  # before kernels are compiled
-    if not window.is_open:
-        raise CoopenvError("there is no display to open a window on; --out DIR writes a film instead")
-    stage = LiveWorld(scenario, log)
-    stage.start(seed, window)
-    stage.run(policy, seed, window, speed, lambda: window.is_open)
-    return stage
 
 
 def vehicle_index(scenario: Scenario, name: str | None) -> int:

@@ -28,6 +28,7 @@ from coopenv.base.files import check_file, new_folder, replacing_file, replacing
 from coopenv.base.seeds import evaluation_seed
 from coopenv.evaluation import Result, drive, held_out_seeds, ranking_key, score
 from coopenv.policies import Policy, load_agent
+from coopenv.policies.alone import Alone
 from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE, check_agent
 from coopenv.policies.network import RightOfWay
 from coopenv.scenario import Scenario
@@ -100,7 +101,7 @@ def possible(plan: TrainingPlan) -> Scenario:
 
     Raises:
         CoopenvError: no vehicle is driven there, a variation is not possible, a driver of the ranking is unknown, or
-            the driver to begin as, or the right of way, lacks what it needs to see.
+            the driver to begin as, the right of way, or the driver `alone`, lacks what it needs to see.
     """
     scenario = open_simulation(plan.environment, plan.all_overrides)
     if not any(scenario.acting):
@@ -109,11 +110,16 @@ def possible(plan: TrainingPlan) -> Scenario:
         tensors_of(plan.settings.start, scenario)
     for name in plan.settings.evaluation.drivers:
         check_agent(name, "driver (evaluation.drivers)")
-    if plan.settings.right_of_way:
-        try:
+    settings = plan.settings
+    try:
+        rule = "right_of_way"
+        if settings.right_of_way:
             RightOfWay(scenario)
-        except ValueError as error:
-            raise CoopenvError(f"right_of_way: {error}") from None
+        rule = "alone"
+        if settings.alone:
+            Alone(scenario, settings.alone)
+    except (CoopenvError, ValueError) as error:
+        raise CoopenvError(f"{rule}: {error}") from None
     for own in plan.watched():
         try:
             for each, _ in own.scenarios():

@@ -99,6 +99,7 @@ def _network(trainer: Trainer, digest: str) -> NetworkCard:
             if name != "time_left"  # goes on for vehicles that have arrived
         },
         right_of_way=trainer.plan.settings.right_of_way,
+        alone=trainer.plan.settings.alone,
     )
 
 
@@ -126,7 +127,7 @@ def _card(trainer: Trainer | SetTrainer, environment: EnvironmentFile, results: 
         "kind": "learned",
         "entry": sets.ENTRY if isinstance(trainer, SetTrainer) else ENTRY,
         "environments": [environment.name, *others],
-        "network": _with_rows(card.model_dump(mode="json"), "observation", "action"),
+        "network": _with_rows(card.model_dump(mode="json", exclude_none=True), "observation", "action"),
         "training": {
             # trains the same once more, in the agent's folder
             "command": join(

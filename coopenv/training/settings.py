@@ -145,6 +145,8 @@ class Settings(Section):
     right_of_way: bool = False
     """Limit the speeds to those at which the driver `look_ahead` gives way, and follow its plans where a vehicle stands
     in the way or the route is too far away."""
+    alone: str | None = None
+    """Agent that drives in place of the finished policy where a vehicle receives no message in its first second."""
     scenario: dict[str, Any] = Field(default={})
     """Overrides of the scenario, as tables or dotted keys, as with `--override`."""
     randomised: dict[str, Any] = Field(default={})

@@ -27,7 +27,14 @@ import warp as wp
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.files import lock, muted_errors
 from coopenv.base.installation import available_cores
-from coopenv.world.warp_internals import SOURCE_RULES, cpu_features, field_types, lanes_guest, replay_of
+from coopenv.world.warp_internals import (
+    SOURCE_RULES,
+    cpu_features,
+    field_types,
+    headers_precompiled,
+    lanes_guest,
+    replay_of,
+)
 
 ATTEMPTS = 3
 """Attempts to load a module: the second rebuilds it, the third is for two processes that rebuild the same one."""
@@ -35,8 +42,8 @@ PROBE_BYTES = 5 << 20  # as much as the source and the code of a large module ha
 LONGEST_COMPILATION = 120.0  # s; a process that holds a lock for longer is taken for suspended (Ctrl-Z)
 SHIPPED = Path(__file__).resolve().parents[1] / "data" / "kernels"  # no other folder: it has machine code
 """Compiled modules of the wheel; of a checkout those of `python -m benchmarks.kernels`."""
-_MODULE, _LOCKS = "wp_", "locks"
-"""Prefix of the folders of modules; folder of the locks."""
+_MODULE, _LOCKS, _HEADERS = "wp_", "locks", "coopenv.headers"
+"""Prefix of the folders of modules; folder of the locks; module with which Warp's headers are compiled."""
 _loaded: set[str] = set()  # names of modules that this process has loaded
 
 
@@ -70,8 +77,36 @@ def launch(kernel: wp.Kernel, **options: Any) -> Any:
     return done
 
 
+def compile_side_by_side(kernels: Sequence[wp.Kernel]) -> None:
+    """Compile for the CPU, one per core, the modules of kernels of which the caches have no version.
+
+    What fails here fails again in `launch`, which repairs or explains it.
+    """
+    found, caches = {kernel.module.name: kernel for kernel in kernels}, (SHIPPED, cache_folder())
+    missing = [found[name] for name in found if not any([*cache.glob(_folders(name))] for cache in caches)]
+    cores = min(len(missing), available_cores())
+    if cores < 2:
+        return
+    probe()
+    with _locked(_HEADERS):
+        for left in cache_folder().glob(_folders(_HEADERS)):
+            shutil.rmtree(left, ignore_errors=True)
+        with headers_precompiled(_HEADERS, _own_options()) as share, ThreadPoolExecutor(cores, "", share) as pool:
+            list(pool.map(_compile, missing))
+
+
+def _compile(kernel: wp.Kernel) -> None:
+    with _locked(kernel.module.name), suppress(Exception):
+        kernel.module.load(wp.get_device("cpu"), 1)
+
+
+def _folders(name: str) -> str:
+    """Return the pattern of the folders of all versions of a module."""
+    return f"{_MODULE}{escape(name)}_{'[0-9a-f]' * 7}"
+
+
 def _launch(kernel: wp.Kernel, options: dict[str, Any]) -> Any:
-    folders = f"{_MODULE}{escape(kernel.module.name)}_{'[0-9a-f]' * 7}"
+    folders = _folders(kernel.module.name)
     for module in SHIPPED.glob(folders):
         if not (cached := cache_folder() / module.name).exists():
             with suppress(OSError):  # it is compiled instead

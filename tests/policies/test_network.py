@@ -226,3 +226,19 @@ def test_the_error_of_an_earlier_version_names_the_command_of_training(
         find_agent("old")
     expected = "old/agent.toml: saved by an earlier version of coopenv; train it anew: coopenv train"
     assert str(error.value) == f"{expected} {command}"
+
+
+def test_a_card_names_who_drives_alone(tmp_path: Path) -> None:
+    scenario, tensors = coopenv.load_scenario(ENV), tensors_for(132)
+    plain, careful = (
+        Network(scenario, folder=tmp_path, network=write(tmp_path, tensors, **alone))
+        for alone in ({}, {"alone": "constant_speed"})
+    )
+    seen = np.random.default_rng(2).uniform(-1, 1, (len(scenario.vehicles), 132)).astype(np.float32)
+    place = observation_layout(scenario)["message_mask"]
+    seen[:, place.start : place.stop] = 0.0
+    for _ in range(round(scenario.rates.decision)):
+        np.testing.assert_array_equal(careful(seen), plain(seen))
+    np.testing.assert_allclose(careful(seen), load_agent("constant_speed", scenario)(seen))
+    careful.reset(np.ones(len(seen), dtype=bool))
+    np.testing.assert_array_equal(careful(seen), plain(seen))

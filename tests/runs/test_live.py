@@ -1,8 +1,8 @@
-"""Episodes in a window or as a film, without a display."""
+"""Episodes as films, without a display."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from inspect import GEN_CLOSED, getgeneratorstate
 from pathlib import Path
@@ -15,83 +15,12 @@ from PIL import Image
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError, OutputError
-from coopenv.cli.app import main
-from coopenv.cli.options import console
 from coopenv.episode import Episode, Origin
-from coopenv.policies import load_agent
 from coopenv.runs.films import Shot, frames_at, top_view_film, write_film, write_pictures
-from coopenv.runs.live import watch
 from coopenv.runs.scenes import frame_stride, scene_of
 from coopenv.viz.stage import Stage
-from coopenv.viz.topview import PictureWindow, TopView
-from tests.helpers.commands import refused
-from tests.helpers.four_way import FOUR_WAY
+from coopenv.viz.topview import TopView
 from tests.helpers.processes import small_disk
-
-AT_ONCE = np.inf
-
-
-class Unseen(PictureWindow):
-    """A window without a display that plays a script: what happens at each picture."""
-
-    def __init__(self, script: Callable[[Unseen, int], None] = lambda window, number: None) -> None:
-        self.pictures: list[np.ndarray] = []
-        self.open, self._script = True, script
-
-    @property
-    def is_open(self) -> bool:
-        return self.open
-
-    def show(self, picture: np.ndarray) -> None:
-        self.pictures.append(picture)
-        self._script(self, len(self.pictures))
-
-
-def test_watching_shows_the_episode_until_the_window_is_closed() -> None:
-    def close(window: Unseen, number: int) -> None:
-        window.open = number < 5
-
-    scenario, window, closed = coopenv.load_scenario(FOUR_WAY, {"horizon": 1.0}), Unseen(), Unseen(close)
-    policy = load_agent("route_follower", scenario)
-    stage = watch(scenario, policy, 1, console(), window, AT_ONCE)
-    assert len(window.pictures) == 13  # the start is there twice, and so is the end
-    assert (window.pictures[2] != window.pictures[10]).any()
-    assert stage.outcomes()[0].startswith("vehicle_1: under way, position error 0.0")
-    watch(scenario, policy, 1, console(), closed, AT_ONCE)
-    assert len(closed.pictures) == 5
-
-
-def test_without_a_display_one_line_says_so(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["watch", "route_follower", "--set", "horizon=1.0"]) == 2
-    error = "error: there is no display to open a window on"
-    assert capsys.readouterr().err.splitlines()[-1] == f"{error}; --out DIR writes a film instead"
-
-
-def test_a_window_is_opened_before_kernels_are_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr(Engine, "load")
-    assert "there is no display" in refused("watch", "route_follower")
-
-
-def test_a_film_in_place_of_the_window(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("coopenv.runs.films.find_spec", lambda name: None)
-    out = tmp_path / "film"
-    assert main(["watch", "route_follower", "--set", "horizon=1.0", "--out", str(out)]) == 0
-    assert capsys.readouterr().out.count("under way, position error") == 4
-    with Image.open(out / "video.gif") as film:
-        assert film.n_frames > 5
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["watch", "nobody"], "unknown agent 'nobody'"),
-        (["watch", "statistics:mean"], "names no environment that it was made for; name one with --env"),
-    ],
-)
-def test_mistakes_are_one_line(options: list[str], message: str) -> None:
-    assert message in refused(*options)
 
 
 @pytest.fixture(scope="module")

@@ -289,12 +289,15 @@ def test_an_environment_that_changed_since(here: Path, capsys: pytest.CaptureFix
             ["train", "facade", "--settings", "rule.toml", "--override", "observation.include=['estimate']"],
             "right_of_way: the observation lacks axis_std",
         ),
+        (["train", "facade", "--settings", "alone.toml"], "alone: the observation lacks message_mask"),
+        (["train", "urban_crossing", "--settings", "wrong.toml"], "alone: unknown agent 'nobody'"),
     ],
 )
 def test_mistakes_are_one_line(
     arguments: list[str], message: str, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (here / "rule.toml").write_text("right_of_way = true")
+    for name, line in (("rule", "right_of_way = true"), ("alone", "alone = 'peek'"), ("wrong", "alone = 'nobody'")):
+        (here / f"{name}.toml").write_text(line)
     assert main(arguments) == 2
     error_text = capsys.readouterr().err
     assert message in error_text and error_text.count("\n") == 1
@@ -371,10 +374,12 @@ def test_without_onnx_no_training_begins(here: Path, monkeypatch: pytest.MonkeyP
 
 def test_a_clone_alone_is_an_agent(here: Path) -> None:
     (here / "train.toml").write_text(
-        "steps = 0\nclone = { agent = 'peek', episodes = 1, epochs = 2 }\n" + SETTINGS.split("\n", 2)[2]
+        "steps = 0\nalone = 'stop_when_lost'\nclone = { agent = 'peek', episodes = 1, epochs = 2 }\n"
+        + SETTINGS.split("\n", 2)[2]
     )
     assert main(fresh()) == 0
     card = read_card(here / "agent")
+    assert card.network and card.network.alone == "stop_when_lost"
     assert card.training["steps"] == 0 and card.network and card.network.seen
     assert not (here / "agent" / "checkpoint.safetensors").exists()
     (here / "agent").rename(here / "first")

@@ -32,15 +32,11 @@ SIZE, ANY = (0.0, LARGEST), (-LARGEST, LARGEST)
 Change = Callable[["Recording", Fault, int], "Recording"]
 
 
-def _unchanged(recording: Recording, fault: Fault, seed: int) -> Recording:
-    return recording
-
-
 @dataclass(frozen=True)
 class RecordFault(FaultKind):
     """A fault that changes a recording, logs included: (recording, fault, seed) -> recording."""
 
-    change: Change = _unchanged
+    change: Change = lambda recording, fault, seed: recording
 
 
 @dataclass(frozen=True)

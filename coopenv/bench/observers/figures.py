@@ -384,14 +384,13 @@ def _short(values: Array) -> list[float]:
 _PANEL, _BASIN_MARGIN = 2.6, 0.6  # inches
 
 
-def basin_figure(board: Leaderboard, width: float | None = None) -> Figure:
+def basin_figure(board: Leaderboard) -> Figure:
     """Draw, per observer, every vehicle of every draw at its initial errors, and the share by angle below."""
     basins = board.basins
-    columns = style.fitting(width or style.PAGE, 3.0, min(3, len(basins)))
+    columns = min(3, len(basins))
     rows = -(-len(basins) // columns)
-    figure, _ = style.canvas(
-        width, _BASIN_MARGIN + _PANEL * rows, f"{board.environment}, {basins[0].draws} initial estimates"
-    )
+    note = f"{board.environment}, {basins[0].draws} initial estimates"
+    figure, _ = style.canvas(None, _BASIN_MARGIN + _PANEL * rows, note)
     grid = figure.add_gridspec(2 * rows, columns, height_ratios=[2, 1] * rows)
     for n, basin in enumerate(basins):
         y, x = divmod(n, columns)

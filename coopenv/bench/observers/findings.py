@@ -16,6 +16,7 @@ from coopenv.observers.recording import Recording
 from coopenv.observers.registry import find
 from coopenv.observers.runner import Run, run
 from coopenv.observers.sensed import Truth
+from coopenv.sources.worlds import stretch
 
 STRETCH, CHANGE = 1.5, 0.5  # s: the length of the changed records, and the latest time of their change
 BEFORE = 4  # usable frames before the change: a gate lets much of the first ones pass
@@ -32,7 +33,7 @@ def findings_on(observer: str | Factory, recording: Recording, result: Run, stea
     """
     if recording.interference is not None or result.failure or getattr(find(observer), "joint", False):
         return ()
-    record = _start(recording)
+    record = stretch(recording, 0, int(np.flatnonzero(recording.t <= STRETCH)[-1]), "record")
     usable = record.visible & record.due[:, None, None]
     usable[..., record.landmarks.shape[1] :] &= record.inbox_tick >= 0
     frames = np.flatnonzero(usable.any(axis=(1, 2)) & (record.t <= CHANGE))
@@ -76,18 +77,6 @@ def _exceeds_gate(record: Recording, result: Run, k: int, moved: Array) -> bool:
     prior = np.sqrt(np.trace(record.start_covariance[:, 3:, 3:], axis1=1, axis2=2))
     allowed = np.sqrt(LARGEST * record.visible.sum(axis=2).max(axis=0))
     return bool((moved > allowed * np.where(np.isfinite(std), std, prior)).any())
-
-
-def _start(recording: Recording) -> Recording:
-    """Return the first `STRETCH` of a record."""
-    early = recording.t <= STRETCH
-    return replace(
-        recording,
-        truth=Truth(recording.truth.rotation[early], recording.truth.position[early]),
-        due=recording.due[early],
-        readings=recording.readings_at(early),
-        **{name: values[early] for name, values in recording.per_tick().items()},
-    )
 
 
 def _turned(record: Recording) -> Recording:

@@ -9,7 +9,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -195,7 +195,7 @@ class Bags(RecordSource):
 
     def check(self) -> None:
         """Look for motion capture, and whether the faults fit."""
-        _opened.clear()
+        _opened.cache_clear()
         backend = self._backend()
         check_truth(self.name, backend.capabilities.truth)
         self._check_faults(backend.scenario)
@@ -211,15 +211,14 @@ class Bags(RecordSource):
 
     def _backend(self) -> Backend:
         times = [path.stat().st_mtime_ns for path in (self.path, self.topics) if path is not None and path.exists()]
-        key = pickle.dumps((self.path, self.topics, self.overrides, self.selection, times))
-        if key not in _opened:
-            _opened.clear()
-            _opened[key] = open_backend(self.path, None, self.overrides, self.selection, topics=self.topics)
-        return _opened[key]
+        return _opened(pickle.dumps((self.path, self.topics, self.overrides, self.selection, times)))
 
 
-_opened: dict[bytes, Backend] = {}
-"""The last bag: reading it takes seconds, and every seed and fault needs the same."""
+@lru_cache(maxsize=1)
+def _opened(key: bytes) -> Backend:
+    """Return a bag; the last one is kept: reading it takes seconds, and every seed and fault needs the same."""
+    path, topics, overrides, selection, _ = pickle.loads(key)
+    return open_backend(path, None, overrides, selection, topics=topics)
 
 
 def check_truth(name: str, known: bool) -> None:

@@ -202,7 +202,6 @@ class Assembler:
 BROADCAST = (Role.ESTIMATE, Role.POINT, Role.REPORT)
 """Messages between cars."""
 
-
 WINDOW = 2_000_000_000  # ns that the present offset is of; a tenth of their stamps may be wrong
 KEPT = 3_000  # messages of a topic, half a minute of 100 Hz, that the drift is of
 

@@ -4,6 +4,7 @@ import gc
 import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,13 +38,13 @@ from coopenv.sources.base import EPISODE_OVER, Capabilities, Command, Health, Ve
 EXPECTED = ("reset", "closed", EPISODE_OVER)
 """Reasons to stop that are no emergency."""
 
-
 FIRST_MESSAGES_TIME = 3.0  # s to wait for first messages at the first reset
 CAMERA_INFO_TIME = 1.5  # s to wait for the calibration of a camera; some publish none
 READY_TIME = 2.0  # s to wait until all conditions of arming hold at once; cars publish theirs once a second
 SETTLE = 0.5  # s for fakes to settle at their start
 
 
+@dataclass(eq=False, repr=False)
 class Svea:
     """Cars as a source of ticks.
 
@@ -51,27 +52,17 @@ class Svea:
     ends early when the watchdog stops the cars; `notes` give the reason.
     """
 
-    def __init__(
-        self,
-        deployment: Deployment,
-        binding: Binding,
-        transport: Transport,
-        signer: Signer | None = None,
-        verifier: Verifier | None = None,
-        recorder: DriveRecorder | None = None,
-    ) -> None:
-        """Listen to the cars.
+    deployment: Deployment
+    binding: Binding
+    transport: Transport  # by whose clock ticks are due; closed with the backend
+    signer: Signer | None = None  # signs sent messages (None: they are not signed)
+    verifier: Verifier | None = None  # knows the cars' keys (None: signatures do not count)
+    recorder: DriveRecorder | None = None  # records the messages of the ticks, and the reasons of stops
 
-        Args:
-            deployment: the fleet.
-            binding: vehicles and markers of its cars.
-            transport: the network, by whose clock ticks are due; closed with the backend.
-            signer: signs sent messages (None: they are not signed).
-            verifier: knows the cars' keys (None: signatures do not count).
-            recorder: records the messages of the ticks, and the reasons of stops.
-        """
-        self.deployment, self.binding, self.scenario = deployment, binding, binding.scenario
-        self._transport, self.recorder, self._clock = transport, recorder, transport.clock
+    def __post_init__(self) -> None:
+        """Listen to the cars."""
+        deployment, binding, transport = self.deployment, self.binding, self.transport
+        self.scenario, self._clock = binding.scenario, transport.clock
         self.capabilities = Capabilities(
             truth=deployment.sensors.truth,
             driven=True,
@@ -99,8 +90,8 @@ class Svea:
         self.intake, self._assembler = Intake(binding, deployment.sensors), Assembler(binding)
         identity, zenoh = deployment.security.identity, deployment.network.kind == "zenoh"
         signers = {profile.topic_of(name, role): (name, identity) for name in fleet for role in BROADCAST}
-        self.station = Station(transport, self.intake.topics, verifier, signers)
-        self.gates = Gates(transport, cars, deployment.limits, signer, verifier, profile, zenoh)
+        self.station = Station(transport, self.intake.topics, self.verifier, signers)
+        self.gates = Gates(transport, cars, deployment.limits, self.signer, self.verifier, profile, zenoh)
         self.board = StatusBoard(transport, cars, deployment.remote, deployment.conditions, profile)
         self.monitor = LinkMonitor(deployment.safety.judge)
         self._streams = StreamMonitor(binding, deployment.sensors.trust, self.intake.lenses)
@@ -131,7 +122,7 @@ class Svea:
         if self.deployment.fakes:
             self._streams.begin()
             signed = ((seed or 0) + 2**63) % 2**64 - 2**63  # the same 64 bits
-            self._transport.publish(RESET_TOPIC, encode(make("std_msgs/msg/Int64", data=signed)), reliable=True)
+            self.transport.publish(RESET_TOPIC, encode(make("std_msgs/msg/Int64", data=signed)), reliable=True)
             self._clock.sleep(SETTLE)  # they go to the start of the seed
         self.monitor.begin(self.pacer.now())
         self._listen(arm)
@@ -322,7 +313,7 @@ class Svea:
             if self.recorder is not None:
                 self.recorder.close()
         finally:
-            self._transport.close()
+            self.transport.close()
             gc.unfreeze()
 
 

@@ -150,12 +150,7 @@ class NeighbourInbox:
     """Received messages of other cars; times in ns on the receiver's clock, positions on the scenario's map."""
 
     def __init__(self, binding: Binding, refused: Counter[str]) -> None:
-        """Begin with nothing.
-
-        Args:
-            binding: vehicles and markers of the cars.
-            refused: counts of messages that are not used, by reason.
-        """
+        """Begin with nothing; messages that are not used are counted in `refused`, by reason."""
         self._binding, self._refused, scenario = binding, refused, binding.scenario
         self._max_age = binding.profile.topics[Role.ESTIMATE].max_age_ns
         self._landmarks = marker_places(scenario.landmarks) - np.array(scenario.map.origin)

@@ -8,6 +8,7 @@ import threading
 from bisect import bisect_right
 from collections import Counter, deque
 from collections.abc import Iterator
+from dataclasses import dataclass
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -188,32 +189,28 @@ class Condition(NamedTuple):
     since: float = float("-inf")  # s, steady: when the condition held
 
 
+@dataclass(eq=False, repr=False)
 class StatusBoard:
     """Last condition of each car, and the reasons to stop it since arming."""
 
-    def __init__(
-        self, transport: Transport, cars: tuple[str, ...], remote: Remote, needed: bool, profile: CarProfile = SVEA
-    ) -> None:
-        """Subscribe to the conditions of the cars.
+    transport: Transport
+    cars: tuple[str, ...]
+    remote: Remote
+    needed: bool  # True if cars must send the conditions of their profile
+    profile: CarProfile = SVEA
 
-        Args:
-            transport: the network.
-            cars: their names.
-            remote: channels of their remote controls.
-            needed: True if cars must send the conditions of their profile.
-            profile: make of the cars.
-        """
-        self._lock, self._clock = threading.Lock(), transport.clock
-        self._remote, self._needed, self._profile = remote, needed, profile
-        self._conditions_needed = tuple(map(Role, profile.conditions)) if needed else ()
-        self._topics = {profile.topic_of(car, role): (car, role) for car in cars for role in ROLES}
+    def __post_init__(self) -> None:
+        """Subscribe to the conditions of the cars."""
+        self._lock, self._clock = threading.Lock(), self.transport.clock
+        self._conditions_needed = tuple(map(Role, self.profile.conditions)) if self.needed else ()
+        self._topics = {self.profile.topic_of(car, role): (car, role) for car in self.cars for role in ROLES}
         self._conditions = {key: Condition() for key in self._topics.values()}
         self._begun: dict[tuple[str, Role], Condition] = {}  # as they were at arming
         self._happened: dict[str, str] = {}
         self.calibrations: dict[str, Calibration] = {}
         """Calibrations of the cars that publish theirs."""
         for topic in self._topics:
-            transport.subscribe(topic, self._take)
+            self.transport.subscribe(topic, self._take)
 
     def begin(self) -> None:
         """Take the present conditions as the reference for changes."""
@@ -256,10 +253,10 @@ class StatusBoard:
 
     def _take(self, arrival: Arrival) -> None:
         key = car, role = self._topics[arrival.topic]
-        topic = self._profile.topics[role]
+        topic = self.profile.topics[role]
         try:
             message = decode(arrival.payload, topic.type)
-            value, stamp = read(role, message, vision=self._profile.vision), stamp_of(message)
+            value, stamp = read(role, message, vision=self.profile.vision), stamp_of(message)
         except CoopenvError:
             return
         delay = (arrival.received - stamp) * 1e-9
@@ -275,18 +272,18 @@ class StatusBoard:
 
     def _driven(self, status: CarStatus) -> str:
         """Return the reason by the remote control not to drive a car; empty: none."""
-        pulses, usual = status.pulses or (), self._profile.pulses
-        if self._remote.drives(pulses, usual):
+        pulses, usual = status.pulses or (), self.profile.pulses
+        if self.remote.drives(pulses, usual):
             return "is driven by remote control"
-        return self._remote.fault(pulses, usual) if Role.REMOTE in self._conditions_needed else ""
+        return self.remote.fault(pulses, usual) if Role.REMOTE in self._conditions_needed else ""
 
     def _changed(self, role: Role, then: CarStatus, now: CarStatus) -> str:
         if role is Role.REMOTE:
             if why := self._driven(now):
                 return why
-            if self._remote.switched(now.pulses or (), then.pulses or (), self._profile.pulses):
+            if self.remote.switched(now.pulses or (), then.pulses or (), self.profile.pulses):
                 return "the mode switch of its remote control was moved"
-        if now.armed is False and (self._needed or then.armed):
+        if now.armed is False and (self.needed or then.armed):
             return "its autopilot is no longer armed"
         if then.mode is not None and now.mode != then.mode:
             return f"its autopilot went from mode {shown(then.mode)} to {shown(now.mode)}"
@@ -294,7 +291,7 @@ class StatusBoard:
 
     def _silent(self, car: str, role: Role) -> str:
         age = self._clock.seconds() - self._conditions[car, role].since
-        if age <= (self._profile.topics[role].max_age or 0.0):
+        if age <= (self.profile.topics[role].max_age or 0.0):
             return ""
         words = "was received" if age == float("inf") else f"for {age:.2f} s"
-        return f"no usable message {words} on {self._profile.topic_of(car, role)}"
+        return f"no usable message {words} on {self.profile.topic_of(car, role)}"

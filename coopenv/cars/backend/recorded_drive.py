@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, OutputError
 from coopenv.base.files import writing
@@ -26,7 +26,7 @@ from coopenv.cars.backend.station import refusal
 from coopenv.cars.link.transport import Arrival, Transport
 from coopenv.cars.messages.codec import STOPPED, TICK, decode, encode, header, make, stamp_of
 from coopenv.cars.settings.deployment import Deployment, parse_deployment
-from coopenv.cars.settings.profile import STOPPED_TOPIC, TICK_TOPIC, presence_of
+from coopenv.cars.settings.profile import STOPPED_TOPIC, TICK_TOPIC, Way, presence_of
 from coopenv.scenario import parse_scenario
 from coopenv.scenario.files import override
 from coopenv.scenario.own_terms import without_own_terms
@@ -258,13 +258,7 @@ class RecordedTransport:
     """
 
     def __init__(self, transport: Transport, recorder: DriveRecorder, aside: Iterable[str] = ()) -> None:
-        """Wrap a transport.
-
-        Args:
-            transport: the network.
-            recorder: records all messages that are sent, and presence.
-            aside: topics of which no ticks are made: what comes on them is written at once.
-        """
+        """Wrap a transport; what comes on topics `aside`, of which no ticks are made, is written at once."""
         self._transport, self._recorder, self.clock = transport, recorder, transport.clock
         self.subscribe, self.announce, self.watch = transport.subscribe, transport.announce, transport.watch
         self.close = transport.close
@@ -272,11 +266,9 @@ class RecordedTransport:
             transport.subscribe(topic, self._write_aside)
         transport.watch(presence_of("*"), self._write_presence)
 
-    def publish(
-        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
-    ) -> None:
+    def publish(self, topic: str, payload: bytes, attachment: bytes = b"", **way: Unpack[Way]) -> None:
         """Send, see `Transport`, and record the message."""
-        self._transport.publish(topic, payload, attachment, urgent=urgent, reliable=reliable)
+        self._transport.publish(topic, payload, attachment, **way)
         self._recorder.write(topic, payload, self.clock.wall())
 
     def _write_aside(self, arrival: Arrival) -> None:

@@ -29,36 +29,28 @@ def refusal(arrival: Arrival, verifier: Verifier | None = None, signers: Collect
     return "" if verifier.signer(arrival.topic, arrival.payload, arrival.attachment) in signers else "signature"
 
 
+@dataclass(eq=False, repr=False)
 class Station:
     """Keeps messages by topic; its callbacks run in threads of the transport and only store."""
 
-    def __init__(
-        self,
-        transport: Transport,
-        topics: Iterable[str],
-        verifier: Verifier | None,
-        signers: Mapping[str, Collection[str]],
-    ) -> None:
-        """Subscribe.
+    transport: Transport
+    topics: Iterable[str]  # to subscribe to
+    verifier: Verifier | None  # checks signatures; None: nothing is signed
+    signers: Mapping[str, Collection[str]]  # identities that may sign a topic, for topics that could be forged
 
-        Args:
-            transport: the network.
-            topics: topics to subscribe to.
-            verifier: checks signatures; None: nothing is signed.
-            signers: identities that may sign a topic, for topics that could be forged.
-        """
-        self._lock, self._clock = threading.Lock(), transport.clock
-        self._waiting: dict[str, deque[Arrival]] = {topic: deque(maxlen=MOST_WAITING) for topic in topics}
+    def __post_init__(self) -> None:
+        """Subscribe."""
+        self._lock, self._clock = threading.Lock(), self.transport.clock
+        self._waiting: dict[str, deque[Arrival]] = {topic: deque(maxlen=MOST_WAITING) for topic in self.topics}
         self._last: dict[str, float] = {}
-        self._verifier, self._signers = verifier, signers
         self.dropped: Counter[str] = Counter()
         """Messages dropped before they were decoded, by reason: overflow, signature, too long."""
         for topic in self._waiting:
-            transport.subscribe(topic, self._keep)
+            self.transport.subscribe(topic, self._keep)
 
     def _keep(self, arrival: Arrival) -> None:
         waiting = self._waiting[arrival.topic]
-        why = refusal(arrival, self._verifier, self._signers.get(arrival.topic))
+        why = refusal(arrival, self.verifier, self.signers.get(arrival.topic))
         with self._lock:
             if why:
                 self.dropped[why] += 1
@@ -172,37 +164,35 @@ class GateState:
         return self.clock.seconds() - self.received
 
 
+@dataclass(eq=False, repr=False)
 class Gates:
     """Sessions with the gates of some cars."""
 
-    def __init__(
-        self,
-        transport: Transport,
-        cars: tuple[str, ...],
-        limits: Limits,
-        signer: Signer | None,
-        verifier: Verifier | None = None,
-        profile: CarProfile = SVEA,
-        probed: bool = True,
-    ) -> None:
-        """Receive from the gates; with a verifier only signed messages.
+    transport: Transport
+    cars: tuple[str, ...]
+    limits: Limits
+    signer: Signer | None
+    verifier: Verifier | None = None
+    """With it only signed messages are received."""
+    profile: CarProfile = SVEA
+    probed: bool = True
+    """Arming tries from here a neutral command to the wheels: a gate that notices it stays shut."""
 
-        Unless not `probed`, arming tries from here a neutral command to the wheels: a gate that notices it stays shut.
-        """
-        self._transport, self._limits, self._signer, self._verifier = transport, limits, signer, verifier
-        self.profile, self.clock, self._probed, self._lock = profile, transport.clock, probed, threading.Lock()
-        self._states = {car: GateState(clock=transport.clock) for car in cars}
+    def __post_init__(self) -> None:
+        """Receive from the gates."""
+        self.clock, self._lock = self.transport.clock, threading.Lock()
+        self._states = {car: GateState(clock=self.clock) for car in self.cars}
         self._before: dict[str, Counter[str]] = {}
-        self._cars = {self.profile.topic_of(car, Role.GATE): car for car in cars}
+        self._cars = {self.profile.topic_of(car, Role.GATE): car for car in self.cars}
         self._stopping = False
         self.stopped_by_others: set[str] = set()
         """Cars stopped by another station, or on the spot, since their last arming."""
-        self.dropped = {car: Counter[str]() for car in cars}
+        self.dropped = {car: Counter[str]() for car in self.cars}
         """Status messages that were dropped, by car and reason."""
         self.session = ""
         self._sequence = 0
         for topic in self._cars:
-            transport.subscribe(topic, self._receive)
+            self.transport.subscribe(topic, self._receive)
 
     @property
     def states(self) -> dict[str, GateState]:
@@ -222,7 +212,7 @@ class Gates:
 
     def _receive(self, arrival: Arrival) -> None:
         car = self._cars[arrival.topic]
-        if why := refusal(arrival, self._verifier, (car,)):
+        if why := refusal(arrival, self.verifier, (car,)):
             self.dropped[car][why] += 1
             return
         try:
@@ -274,8 +264,8 @@ class Gates:
                 self.end()
                 raise CoopenvError(f"{closed[0]}: {_why_closed(before[closed[0]], states[closed[0]])}")
             for car in closed:
-                if self._probed:  # like the arming, so that it comes before it
-                    self._transport.publish(*neutral_command(self.profile, car, self.clock), reliable=True)
+                if self.probed:  # like the arming, so that it comes before it
+                    self.transport.publish(*neutral_command(self.profile, car, self.clock), reliable=True)
                 self._arm(car, True, states[car].nonce)  # of that status: a later stop invalidates it
             self.clock.sleep(RETRY)
         with self._lock:
@@ -315,7 +305,7 @@ class Gates:
 
     def command(self, car: str, speed: float, steering: float, acceleration: float) -> None:
         """Send a command: m/s, rad, m/s^2, clipped to the limits."""
-        limits = self._limits
+        limits = self.limits
         speed = min(max(speed, -limits.speed if limits.reverse else 0.0), limits.speed)
         steering = min(max(steering, -limits.steering), limits.steering)
         numbers = steering, limits.steering_rate, speed, min(acceleration, limits.acceleration), 0.0
@@ -329,16 +319,14 @@ class Gates:
     def send(self, car: str, role: Role, payload: bytes) -> None:
         """Send a message on a topic of a car, signed."""
         topic = self.profile.topic_of(car, role)
-        signature = b"" if self._signer is None else self._signer.sign(topic, payload)
-        kind = self.profile.topics[role]
-        self._transport.publish(topic, payload, signature, urgent=kind.urgent, reliable=kind.reliable)
+        signature = b"" if self.signer is None else self.signer.sign(topic, payload)
+        self.transport.publish(topic, payload, signature, **self.profile.topics[role].way)
 
 
 BYPASSED = (
     "commands get to its wheels that this gate has not sent: stop a second gate, or give its bridge "
     "docker/car-zenoh.json5 (docs/cars_safety.md#ways-around-the-gate)"
 )
-
 
 UNTRIED = "has no access rules: past the gate, any of its programs can command the wheels; arming cannot try that"
 """Warning for networks other than Zenoh."""

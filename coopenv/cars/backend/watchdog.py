@@ -197,45 +197,29 @@ class Trip:
     time: float = 0.0  # steady, s
 
 
+@dataclass(eq=False, repr=False)
 class Watchdog:
     """Watches armed cars. Once it has stopped them, they stand until it is armed again."""
 
-    def __init__(
-        self,
-        safety: Safety,
-        station: Station,
-        gates: Gates,
-        monitor: LinkMonitor,
-        cars: Collection[str],
-        others: Collection[str],
-        odometry: Collection[Role],
-        decision: float,
-        happened: Callable[[str], str] = lambda car: "",
-        stopped: Callable[[Trip], None] = lambda trip: None,
-    ) -> None:
-        """Begin to look.
+    safety: Safety
+    station: Station
+    gates: Gates
+    monitor: LinkMonitor
+    cars: Collection[str]  # that are driven here
+    others: Collection[str]  # of the fleet
+    odometry: Collection[Role]  # required measurements of each car
+    decision: float  # s between decisions
+    happened: Callable[[str], str] = lambda car: ""  # the reason to stop a car by its own conditions; empty: none
+    stopped: Callable[[Trip], None] = lambda trip: None  # called when the cars are stopped
 
-        Args:
-            safety: limits.
-            station: receiver of the messages.
-            gates: of the cars.
-            monitor: ages of messages and positions of cars.
-            cars: the cars that are driven here.
-            others: the other ones of the fleet.
-            odometry: required measurements of each car.
-            decision: s between decisions.
-            happened: returns the reason to stop a car by its own conditions; empty: none.
-            stopped: called when the cars are stopped.
-        """
-        self._safety, self._station, self._gates, self._monitor = safety, station, gates, monitor
-        self._cars, self._others, self._odometry, self._decision = cars, others, odometry, decision
-        self._happened, self._stopped = happened, stopped
+    def __post_init__(self) -> None:
+        """Begin to look."""
         self._lock = threading.Lock()
-        self._armed, self._clock = False, gates.clock
+        self._armed, self._clock = False, self.gates.clock
         self.trip: Trip | None = None
         self._beat: float | None = None  # of the last decision; None: there has been none
         self._missed = 0
-        self._present = dict.fromkeys(map(presence_of, cars), True)
+        self._present = dict.fromkeys(map(presence_of, self.cars), True)
         self._repeated, self._looked, self._stalled = 0.0, self._clock.seconds(), False
         self._closed, self._end = False, self._clock.repeat(PERIOD, self._look, "coopenv watchdog")
 
@@ -273,10 +257,10 @@ class Watchdog:
             self._armed = False
             self.trip = trip = Trip(reason, car, self._clock.seconds())
         try:
-            self._gates.stop()
-            self._stopped(trip)
+            self.gates.stop()
+            self.stopped(trip)
         finally:
-            self._gates.end()
+            self.gates.end()
 
     def close(self) -> None:
         """Look no more."""
@@ -299,42 +283,42 @@ class Watchdog:
                     self.stop(f"{car}: {why}" if car else why, car)
             elif self.trip is not None and self._looked - self._repeated > REPEAT:
                 self._repeated = self._looked
-                self._gates.stop()
+                self.gates.stop()
 
     def _problems(self) -> Iterator[tuple[str, str]]:
         """Yield the car and the reason of each violated rule; a car is empty where it is no single one."""
-        away = [car for car in self._cars if not self._present[presence_of(car)]]
-        for car in self._cars:
+        away = [car for car in self.cars if not self._present[presence_of(car)]]
+        for car in self.cars:
             yield from ((car, why) for why in self.silent(car))
             if car in away:
                 yield car, "is gone" + (", as others: is the router running?" if len(away) > 1 else "")
-            if why := self._happened(car) or self._monitor.doubt(car):
+            if why := self.happened(car) or self.monitor.doubt(car):
                 yield car, why
-        for car, gate in self._gates.states.items():
+        for car, gate in self.gates.states.items():
             if gate.age > OLD:
                 yield car, f"its gate is silent for {gate.age:.2f} s"
             elif gate.state not in OPEN:
-                foreign = self._gates.refused(car).get(Reason.FOREIGN)
+                foreign = self.gates.refused(car).get(Reason.FOREIGN)
                 yield car, f"its gate is {gate.state}" + (f": {foreign} {BYPASSED}" if foreign else "")
-            elif gate.session != self._gates.session:
+            elif gate.session != self.gates.session:
                 yield car, "another station has armed its gate"
-            elif beyond := self._gates.refused(car).get(Reason.LIMITS):
+            elif beyond := self.gates.refused(car).get(Reason.LIMITS):
                 yield car, f"its gate has refused {beyond} commands: its limits are lower than those of the file here"
-        missed, beat = self._safety.missed_deadlines, self._beat
+        missed, beat = self.safety.missed_deadlines, self._beat
         if self._missed >= missed:
             yield "", f"{self._missed} decisions in a row came too late"
         if beat is not None:
-            if (age := self._clock.seconds() - beat) > (missed + 1) * self._decision:
+            if (age := self._clock.seconds() - beat) > (missed + 1) * self.decision:
                 yield "", f"no decision for {age:.2f} s"
             yield from self.misplaced()
 
     def silent(self, car: str) -> Iterator[str]:
         """Yield the topics of a car's odometry without a message, or a usable one, for too long, in words."""
-        for role in self._odometry:
-            topic = self._gates.profile.topic_of(car, role)
-            ages = {"odometry": self._station.silence(topic), "usable new message": self._monitor.age(car, role)}
+        for role in self.odometry:
+            topic = self.gates.profile.topic_of(car, role)
+            ages = {"odometry": self.station.silence(topic), "usable new message": self.monitor.age(car, role)}
             for what, age in ages.items():
-                if age > self._safety.odometry_age:
+                if age > self.safety.odometry_age:
                     yield f"no {what} on {topic} {since(age)}"
 
     def misplaced(self) -> Iterator[tuple[str, str]]:
@@ -342,9 +326,9 @@ class Watchdog:
 
         Cars that are driven here have to be inside the fence, and apart from all.
         """
-        safety, monitor, cars = self._safety, self._monitor, self._cars
+        safety, monitor, cars = self.safety, self.monitor, self.cars
         apart = safety.separation > 0.0
-        watched = [*cars, *self._others] if apart else [*cars] if safety.geofence else []
+        watched = [*cars, *self.others] if apart else [*cars] if safety.geofence else []
         for car in watched:
             never = car not in monitor.places
             allowed = max(safety.truth_age, UNSETTLED) if never else safety.truth_age
@@ -374,5 +358,5 @@ class Watchdog:
     def _way_to_stand(self, place: Place) -> Array:
         """Return the vector (2,), m, along which a car moves until it stands, by the cause of the longest way."""
         speed = float(np.linalg.norm(place.velocity[:2]))
-        way = max(way for _, way in self._safety.stopping(speed, self._gates.profile.command).values())
+        way = max(way for _, way in self.safety.stopping(speed, self.gates.profile.command).values())
         return place.velocity[:2] * (way / max(speed, 1e-9))

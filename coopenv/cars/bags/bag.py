@@ -15,11 +15,10 @@ import numpy as np
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning, check_one_of, listed
 from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.binding import OPTIONS, bind, reset_options
-from coopenv.cars.bags.files import check_extra
 from coopenv.cars.bags.log import read_log
 from coopenv.cars.bags.topic_map import UNNEEDED, TopicMap, load_map
 from coopenv.cars.bags.topics import NS
-from coopenv.cars.doctor.finding import Treatment
+from coopenv.cars.doctor.finding import Finding, Treatment
 from coopenv.cars.doctor.streams import Streams
 from coopenv.cars.messages.readings import Sample
 from coopenv.cars.settings.profile import Role
@@ -35,7 +34,6 @@ LONGEST_GAP = 600.0  # s without any message that is needed
 
 OFF = 0.1
 """Share by which the rate of a camera may differ from the environment's without a warning."""
-
 
 ENDLESS = {
     "termination.arrival": False,
@@ -83,9 +81,8 @@ class Bag(TickGenerator):
         Raises:
             TopicMapError: the map is not valid.
             DataError: a bag cannot be read, or something that is needed is missing.
-            CoopenvError: the environment or an override is not valid, or the extra is not installed.
+            CoopenvError: the environment or an override is not valid.
         """
-        check_extra()
         given = topics if isinstance(topics, TopicMap) else load_map(topics)
         self.map = given.model_copy(update={"trust": (*given.trust, *trust)})
         self.changes = changes = {**ENDLESS, **self.map.overrides, **(overrides or {})}
@@ -201,13 +198,12 @@ class Bag(TickGenerator):
     @property
     def streams(self) -> Streams:
         """Every stream once, on one clock."""
-        assert self.log.streams is not None
         return replace(self.log.streams, binding=self.binding)
 
     @property
-    def is_refused(self) -> bool:
-        """Whether streams contradict each other in a way that estimates cannot stand."""
-        return any(finding.treatment is Treatment.REFUSED for finding in self.log.findings)
+    def refused(self) -> list[Finding]:
+        """Contradictions of streams that estimates cannot stand."""
+        return [finding for finding in self.log.findings if finding.treatment is Treatment.REFUSED]
 
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> TickStream:
         """Go through the bags tick by tick; the option `arm` has no effect.
@@ -216,8 +212,7 @@ class Bag(TickGenerator):
             DataError: streams contradict each other in a way that estimates cannot stand, and are not trusted.
         """
         reset_options(options)
-        refused = [finding for finding in self.log.findings if finding.treatment is Treatment.REFUSED]
-        if refused:
+        if refused := self.refused:
             more = f" (and {len(refused) - 1} more: coopenv doctor)" if len(refused) > 1 else ""
             raise DataError(f"{self.where}: {refused[0]}; --trust '{refused[0].subject}' uses it unchanged{more}")
         assembler, samples, following = Assembler(self.binding), sorted(self.log.samples, key=_used), 0

@@ -13,6 +13,7 @@ Statistical Association 63, 1968.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,14 +154,15 @@ Leads = Mapping[str, Lead]  # by topic
 class SampledSignal:
     """A cumulated signal of time: heading, distance or pose; there is none within holes."""
 
-    def __init__(self, times: Array, values: Array) -> None:
-        """Take increasing times (n,), s, and values (n,) or (n, k)."""
+    def __init__(self, times: Array, values: NDArray[Any]) -> None:
+        """Take increasing times (n,), s, and values (n,) or (n, k); planar ones, complex, count as two."""
+        values = np.column_stack([values.real, values.imag]) if np.iscomplexobj(values) else values
         self.times, self.values = times, values.reshape(len(times), -1)
         ends = np.flatnonzero(np.diff(times) > HOLE)
         self._from, self._to = times[ends], times[ends + 1]
 
     @classmethod
-    def of_rates(cls, times: Array, rates: Array) -> "SampledSignal":
+    def of_rates(cls, times: Array, rates: NDArray[Any]) -> "SampledSignal":
         """Return the integral of rates (n,)."""
         return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) * (rates[1:] + rates[:-1]) / 2)]))
 

@@ -1,6 +1,4 @@
-"""Bags as files: ROS 1 `.bag`, ROS 2 folders, bare `.db3` and `.mcap`."""
-
-from __future__ import annotations
+"""Bags as files: ROS 1 `.bag`, ROS 2 folders, bare `.db3` and `.mcap`. Needs the extra `log`."""
 
 import tempfile
 import warnings
@@ -9,23 +7,24 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from heapq import merge
-from importlib.util import find_spec
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, error_text, listed, printable
-from coopenv.base.installation import install_command
+from coopenv.base.installation import install_command, needing
 from coopenv.cars.backend.sources import metadata_names
 from coopenv.cars.settings.profile import COMPRESSED
 from coopenv.sources.mcap_format import MAGIC, REPAIR
 
-if TYPE_CHECKING:
-    from coopenv.cars.bags.definitions import BagChannel
-    from coopenv.cars.bags.streams import Part
+with needing(f"ROS bags need an extra: {install_command('log')}"):
+    from coopenv.cars.bags.definitions import BagChannel, decode, stamp, with_raw_frame
+    from coopenv.cars.bags.reader import ReaderError, in_reader
+    from coopenv.cars.bags.streams import Part, blocks_of
+    from coopenv.sources.mcap_container import TooLargeError
 
 METADATA, PACKED = "metadata.yaml", ".zstd"
 OURS = "coopenv"
@@ -49,12 +48,9 @@ class BagFile:
     def __init__(self, path: Path, colours: bool = False) -> None:
         """Open a bag; compressed frames are decoded with colours or in shades of grey.
 
-        Raises:
-            CoopenvError: the extra is not installed.
-            DataError: no such bag, none at all, or damaged beyond reading.
+        Raises DataError: no such bag, none at all, or damaged beyond reading.
         """
         self.path, self._colours = path, colours
-        check_extra()
         if not path.exists():
             raise DataError(f"no such bag: {path}")
         if path.is_file() and path.suffix not in REPAIRS:
@@ -96,8 +92,6 @@ class BagFile:
 
     def _opened(self) -> list[Part]:
         """Return the files with messages. Raises an error of the libraries, or that of a file without any message."""
-        from coopenv.cars.bags.streams import Part
-
         files = [self._unpacked(file) if file.suffix == PACKED else file for file in self._files]
         if not files:
             raise ValueError("no file with messages is beside its metadata")
@@ -111,9 +105,6 @@ class BagFile:
 
     def _unpacked(self, file: Path) -> Path:
         """Return a copy of a packed file that is unpacked, until the bag is closed. Raises TooLargeError."""
-        from coopenv.cars.bags.reader import in_reader
-        from coopenv.cars.bags.streams import blocks_of
-
         place = Path(self._stack.enter_context(tempfile.TemporaryDirectory()), file.name.removesuffix(PACKED))
         with place.open("wb") as out:
             for _, _, block in in_reader(partial(blocks_of, file), file.stat().st_size):
@@ -126,8 +117,6 @@ class BagFile:
         Messages of a file that breaks off, or a part of which is damaged, are those before; a DataWarning was given.
         The decoder raises CoopenvError: the message makes no sense.
         """
-        from coopenv.cars.bags.definitions import decode
-
         for topic, count in Counter(c.topic for c in self.channels if c.topic in topics).items():
             if count > MOST_DEFINITIONS:
                 raise DataError(f"{self.path}: {printable(topic)} has over {MOST_DEFINITIONS} types and definitions")
@@ -136,8 +125,6 @@ class BagFile:
 
     def times(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
         """Return stamps (0: none) and times of reception (n,), ns, of the messages of every topic."""
-        from coopenv.cars.bags.definitions import stamp
-
         found: dict[str, list[tuple[int, int]]] = {name: [] for name in self.topics}
         for channel, received, data in self._raw(self.topics):
             found[channel.topic].append((stamp(channel, data), received))
@@ -147,9 +134,6 @@ class BagFile:
 
     def _raw(self, topics: Collection[str], frames: bool = False) -> Iterator[tuple[BagChannel, int, bytes]]:
         """Yield channel, time of reception and bytes of messages; with `frames` compressed ones as raw ones."""
-        from coopenv.cars.bags.reader import ReaderError, in_reader
-        from coopenv.sources.mcap_container import TooLargeError
-
         wanted = {channel for channel in self.channels if channel.topic in topics}
         if not wanted:
             return
@@ -166,8 +150,6 @@ class BagFile:
 
     def _merged(self, wanted: Collection[BagChannel], frames: bool) -> Iterator[tuple[BagChannel, int, bytes]]:
         """Yield the messages of all parts, in the reader process."""
-        from coopenv.cars.bags.definitions import with_raw_frame
-
         for channel, received, data in merge(*(part.messages(wanted) for part in self._parts), key=itemgetter(1)):
             if frames and channel.kind == COMPRESSED:
                 yield with_raw_frame(channel, received, data, self._colours)
@@ -192,8 +174,6 @@ class BagFile:
             warnings.warn(f"{self.path}: {text}", DataWarning, stacklevel=3)
 
     def _unreadable(self, error: Exception) -> DataError:
-        from coopenv.sources.mcap_container import TooLargeError
-
         if isinstance(error, TooLargeError):
             return DataError(f"{self.path}: {error}")
         hint = ""
@@ -203,9 +183,3 @@ class BagFile:
                 if repair and stream.read(len(begin)) == begin:
                     hint = f"; if its recording was cut off, `{repair}` mends it"
         return DataError(f"{self.path}: cannot be read as a ROS bag ({error_text(error)}){hint}")
-
-
-def check_extra() -> None:
-    """Make sure that bags can be read. Raises CoopenvError: the extra is not installed."""
-    if find_spec("rosbags") is None:
-        raise CoopenvError(f"ROS bags need an extra: {install_command('log')}")

@@ -4,7 +4,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import compress, groupby
 from pathlib import Path
@@ -30,7 +30,7 @@ from coopenv.cars.gate.wheel_command import read_drive
 from coopenv.cars.messages.codec import encode, stamp_of
 from coopenv.cars.messages.detectors import PLACED
 from coopenv.cars.messages.readings import OTHER_FIELDS, CarPose, Detections, Sample, Twist, Value, read
-from coopenv.cars.messages.stated import Stated, stated
+from coopenv.cars.messages.stated import stated
 from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.profile import Role
 from coopenv.cars.settings.sensors import Correction
@@ -83,14 +83,9 @@ def value_reader(
     return read_value
 
 
-def _published(
-    files: Sequence[BagFile], chosen: Collection[Chosen], given: TopicMap
-) -> dict[str, tuple[Calibration, Stated]]:
-    """Return the first usable calibration of each car that publishes one, and what its message states besides."""
-    cars, found = (
-        {e.topic: e.car for e in chosen if e.role is Role.CAMERA_INFO},
-        dict[str, tuple[Calibration, Stated]](),
-    )
+def _published(files: Sequence[BagFile], chosen: Collection[Chosen], given: TopicMap) -> dict[str, Calibration]:
+    """Return the first usable calibration of each car that publishes one."""
+    cars, found = {e.topic: e.car for e in chosen if e.role is Role.CAMERA_INFO}, dict[str, Calibration]()
     for file in files:
         left, why = cars.keys() & file.topics.keys(), dict[str, str]()
         for topic, _, decode in file.messages(frozenset(left)) if left else ():
@@ -100,7 +95,7 @@ def _published(
                     if np.any(getattr(message, "k", getattr(message, "K", 1.0))):
                         value = read(Role.CAMERA_INFO, message, vision=given.vision)
                         if isinstance(value, Calibration):
-                            found.setdefault(cars[topic], (value, stated(message)))
+                            found.setdefault(cars[topic], value)
                         left.remove(topic)
                     else:
                         why.setdefault(topic, "")
@@ -204,18 +199,10 @@ class BagLog:
     samples: tuple[Sample, ...]  # in the order of their stamps, which all are on one clock
     rows: tuple[TopicRow, ...]  # topics of the bag
     notes: tuple[str, ...]  # remarks for the user
-    lenses: Mapping[str, Calibration] = field(default_factory=dict)  # by car; none: its bearings are without pixels
-    added: Mapping[tuple[str, Role], tuple[str, float]] = field(default_factory=dict)
-    """By car and role: the topic, and s that were added to its stamps."""
-    unknown_markers: Mapping[int, int] = field(default_factory=dict)
-    """Detections by the number of the marker, of markers that are not in the map."""
-    sent: Mapping[tuple[str, Role], tuple[Sample, ...]] = field(default_factory=dict)
-    """Samples with unchanged times, by car and role."""
-    cameras: Mapping[str, Stated] = field(default_factory=dict)
-    """Contents of the CameraInfo of each car that publishes one, beside the calibration in `lenses`."""
-    findings: tuple[Finding, ...] = ()
-    """Streams that others contradict."""
-    streams: Streams | None = None  # the same, as arrays
+    unknown_markers: Mapping[int, int]  # detections by the number of the marker, of markers that are not in the map
+    sent: Mapping[tuple[str, Role], tuple[Sample, ...]]  # samples with unchanged times, by car and role
+    findings: tuple[Finding, ...]  # streams that others contradict
+    streams: Streams  # the same samples, the lenses of cameras, and what was added to stamps
 
 
 def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog:
@@ -238,8 +225,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         lenses = {car: Calibration.of(camera) for car, camera in cameras.items() if camera.model == "pinhole"}
         if given.vision.rectified:
             lenses = {name: replace(lens, distortion=(0.0,) * 5) for name, lens in lenses.items()}
-        published = _published(files, chosen, given)
-        lenses |= {car: lens for car, (lens, _) in published.items()}  # it replaces the environment's
+        lenses |= _published(files, chosen, given)  # which replace the environment's
         lenses |= {car: made.lens(lenses[car]) for car, made in given.corrections.items() if car in lenses}
         placed = {e.car for e in chosen if e.role is Role.DETECTIONS and topics[e.topic] in PLACED}
         for car in binding.cars.keys() - lenses.keys() - placed:
@@ -313,8 +299,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     constants = examine_constants(examined, partial(drive_of_car, streams), trusted)
     timing = [*of_timing(tracks, samples, drifts, examined, trusted), *([treated(common, trusted)] if common else [])]
     findings = [*timing, *examined.findings, *constants]
-    stating = {car: about for car, (_, about) in published.items()}
-    return BagLog(samples, rows, tuple(notes), pixels, added, unknown, sent, stating, tuple(findings), streams)
+    return BagLog(samples, rows, tuple(notes), unknown, sent, tuple(findings), streams)
 
 
 def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:

@@ -17,8 +17,9 @@ import numpy as np
 from coopenv.base.errors import CoopenvError, DataWarning, listed
 from coopenv.base.files import replacing_folder, writing
 from coopenv.cars.backend.binding import marker_places
-from coopenv.cars.bags.files import METADATA, check_extra
+from coopenv.cars.bags.files import METADATA  # which names a missing extra
 from coopenv.cars.messages.codec import encode, header, make, pose, ros2
+from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.profile import TRANSFORMS
 from coopenv.cars.settings.toml import toml_text
 from coopenv.estimation.poses import Array, covariance_in_map, exp_so3, exp_translation, log_so3
@@ -73,11 +74,8 @@ def write_bag(recording: Recording, folder: str | Path, estimates: Run | None = 
         folder: of the bag.
         estimates: of an observer on the recording, for the topics `estimate`; None: they are absent.
 
-    Raises:
-        CoopenvError: the extra `log` is not installed.
-        OutputError: the folder cannot be written.
+    Raises OutputError: the folder cannot be written.
     """
-    check_extra()
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     folder, scenario = Path(folder), recording.scenario
@@ -178,7 +176,8 @@ class _Vehicle:
         seen = np.flatnonzero(r.visible[k, i] & np.isfinite(r.bearings[k, i]).all(axis=-1)) if k >= 0 else ()
         optical = header(time - round(self._ages[max(k, 0)] * 1e9), f"{self.name}/camera")
         if k < 0 and self._calibrated:
-            yield "camera_info", _camera_info(self._camera, optical)
+            info = Calibration.of(self._camera).info
+            yield "camera_info", make("sensor_msgs/msg/CameraInfo", header=optical, **info)
         found = [self._marker(k, int(target), optical) for target in seen]
         yield "detections", make("aruco_msgs/msg/MarkerArray", header=optical, markers=found)
         if k > 0:
@@ -273,13 +272,6 @@ def _moved(pose: tuple[Array, Array], increment: tuple[Array, Array]) -> tuple[A
 def _transform(rotation: Array, position: Array) -> Any:
     placed = pose(rotation, position)
     return make("geometry_msgs/msg/Transform", translation=tuple(position), rotation=placed.orientation)
-
-
-def _camera_info(camera: Camera, about: Any) -> Any:
-    (width, height), (fx, fy), (cx, cy) = camera.image_size, camera.focal_length, camera.principal_point
-    matrices = {"k": [fx, 0, cx, 0, fy, cy, 0, 0, 1], "r": np.eye(3), "p": [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]}
-    lens = {"distortion_model": "plumb_bob", "d": camera.distortion, **matrices}
-    return make("sensor_msgs/msg/CameraInfo", header=about, width=width, height=height, **lens)
 
 
 def _markers(time: int, places: Array) -> Any:

@@ -95,7 +95,6 @@ COMMANDS = (Role.MANUAL, Role.COMMAND)
 UNNEEDED = (Role.CAMERA_INFO, Role.TRUTH, *COMMANDS)
 """Roles without which there are ticks."""
 
-
 FrameName = Annotated[str, Field(max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_/]*$")]
 
 

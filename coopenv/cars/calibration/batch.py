@@ -29,8 +29,24 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import DataError
 from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive, averaged
-from coopenv.estimation.lens import COEFFICIENTS, distort, largest_radius
-from coopenv.estimation.poses import Array, skew
+from coopenv.cars.calibration.parameters import (
+    BIAS,
+    BODY,
+    CAMERA_TIME,
+    FRAME,
+    LENS,
+    LEVER,
+    NUISANCE,
+    PER_CAR,
+    ROT,
+    SCALE,
+    TRUTH_TIME,
+    WHEEL_TIME,
+    kinds_of,
+)
+from coopenv.cars.calibration.resection import misfits, seen_from
+from coopenv.estimation.lens import distort, largest_radius
+from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import Mask
 from coopenv.scenario import Scenario
 
@@ -42,47 +58,7 @@ LEAST_PIXEL, LEAST_ANGLE, LEAST_PLACE, LEAST_YAW = 0.2, 5e-4, 1e-3, 2e-3
 """Least standard deviations of a sighting (pixels; rad without pixels) and of motion capture (m, rad)."""
 LEAST_SPEED, LEAST_TURN = 1e-6, 1e-7  # m^2/s and rad^2/s, least densities of odometry noise
 WINDOW = 6.0  # s of sightings from which a first pose is found
-HEADINGS = 36  # that are tried for it; the finer ones about the best reach beyond half a step
 LATE = np.arange(-0.5, 0.51, 0.05)  # s, offsets of motion capture that are tried
-
-
-class ParameterKind(NamedTuple):
-    """A constant: a deviation from its given value."""
-
-    name: str
-    unit: str
-    prior: float  # standard deviation; rad for deg
-    step: float  # of differences
-    part: str = ""  # title of the finding that names it
-
-
-PER_CAR = (
-    *(ParameterKind(f"camera.{name}", "deg", 0.2, 1e-6, "camera orientation") for name in ("roll", "pitch", "yaw")),
-    *(ParameterKind(f"camera.{name}", "m", 0.3, 1e-6, "camera position") for name in "xyz"),
-    *(ParameterKind(f"camera.{name}", "px", 40.0, 1e-4, "focal length") for name in ("fx", "fy")),
-    *(ParameterKind(f"camera.{name}", "px", 40.0, 1e-4, "principal point") for name in ("cx", "cy")),
-    *(
-        ParameterKind("camera.", "", 0.0, 1e-7, "lens distortion") for _ in range(max(COEFFICIENTS))
-    ),  # by the model of the lens
-    ParameterKind("wheel.scale", "", 0.15, 1e-7, "wheel scale"),
-    ParameterKind("gyro.bias", "rad/s", 0.1, 1e-7, "gyro bias"),
-    ParameterKind("camera.offset", "s", 0.5, 1e-5, "stamps"),
-    ParameterKind("wheel.offset", "s", 0.05, 1e-5, "stamps"),
-    ParameterKind("truth.offset", "s", 0.5, 1e-5, "stamps"),
-    ParameterKind("truth.body_yaw", "deg", 0.2, 1e-6, "body of motion capture"),
-    *(ParameterKind(f"truth.body_{axis}", "m", 0.1, 1e-6, "body of motion capture") for axis in "xy"),
-)
-"""Constants of a car."""
-FRAME = (
-    ParameterKind("truth.frame_yaw", "deg", 0.2, 1e-6, "frame of motion capture"),
-    *(ParameterKind(f"truth.frame_{axis}", "m", 0.3, 1e-6, "frame of motion capture") for axis in "xy"),
-)
-BENT = {"k1": 0.5, "k2": 0.5, "p1": 0.02, "p2": 0.02}
-"""Priors of coefficients; 0.2 for all others."""
-ROT, LEVER, LENS, SCALE, BIAS = slice(0, 3), slice(3, 6), slice(6, 18), 18, 19
-CAMERA_TIME, WHEEL_TIME, TRUTH_TIME, BODY = 20, 21, 22, slice(23, 26)
-NUISANCE = (SCALE, BIAS)
-"""Constants that every drive has anew."""
 
 
 class Path(NamedTuple):
@@ -125,26 +101,9 @@ class Batch:
         self.truth = [truth and len(car.truth_time) > 1 for car in drive.cars]
         none: dict[str, Any] = dict.fromkeys(("truth_time", "truth", "truth_yaw"), np.zeros(0))
         self.cars = [car if has else replace(car, **none) for car, has in zip(drive.cars, self.truth, strict=True)]
-        self.kinds = [
-            *(
-                kind._replace(name=f"{car.name}.{kind.name}", part=f"{car.name}: {kind.part}")
-                for car in self.cars
-                for kind in PER_CAR
-            ),
-            *(
-                ParameterKind(f"marker.{name}.{axis}", "m", 0.3, 1e-6, f"marker {name}: position")
-                for name in drive.landmarks
-                for axis in "xyz"
-            ),
-            *FRAME,
-        ]
+        self.kinds = kinds_of(self.cars, drive.landmarks)
         self.markers = len(PER_CAR) * len(self.cars)
         self.frame = len(self.kinds) - len(FRAME)
-        for c, car in enumerate(self.cars):
-            names = () if car.lens is None else COEFFICIENTS[len(car.lens.distortion)]
-            for n, name in zip(self.lens(c)[4:], names, strict=True):
-                kind = self.kinds[n]
-                self.kinds[n] = kind._replace(name=kind.name + name, prior=BENT.get(name, 0.2))
         self.prior = np.array([kind.prior or 1.0 for kind in self.kinds])
         self.steps = np.array([kind.step for kind in self.kinds])
         self.known = np.ones(len(self.kinds), dtype=bool)
@@ -441,41 +400,6 @@ class Batch:
         return np.stack([now.real, now.imag, np.unwrap(yaw)], axis=-1), float(misfit.mean())
 
 
-def seen_from(unit: Array, lever: Array, point: Array) -> tuple[float, float, complex]:
-    """Return misfit, heading and place of a body by rays (n, 3) from its `lever` (n, 3), m, to points (n, 3), m.
-
-    With a heading given, the place is linear in the sightings: all headings are tried together, then finer ones.
-    """
-    across, (x, y, z) = skew(unit), point.T
-    flat, none = across[:, :, :2], np.zeros_like(z)
-    squares = np.einsum("nik,nil->nkl", flat, flat).reshape(-1, 4)
-    parts = [np.stack(part, axis=-1) for part in ((x, y, none), (y, -x, none), (none, none, z))]
-    parts[2] -= lever  # the three go with cosine, sine and 1
-    rows = np.concatenate([np.einsum("nik,nij,nj->nk", flat, across, part) for part in parts], axis=-1)
-
-    def fitted(headings: NDArray[Any]) -> tuple[float, float, complex]:
-        turn = np.stack([np.cos(headings), np.sin(headings), np.ones(len(headings))], axis=-1)
-        to = np.tensordot(turn, parts, axes=1)
-        ahead, weight = to, np.ones(to.shape[:2])
-        for _ in range(2):
-            information = (weight @ squares).reshape(-1, 2, 2) + 1e-9 * np.eye(2)
-            moments = np.einsum("hp,hpk->hk", turn, (weight @ rows).reshape(-1, 3, 2))
-            shift = np.linalg.solve(information, moments[..., None])[..., 0]
-            ahead = to - np.append(shift, np.zeros((len(shift), 1)), axis=1)[:, None]
-            weight = 1.0 / np.maximum((ahead**2).sum(axis=-1), 0.01)
-        missed = misfits(unit, ahead)
-        best = int(np.argmin(missed))
-        place = np.exp(1j * headings[best]) * complex(*shift[best])
-        return float(missed[best]), float(headings[best]), place
-
-    tried: NDArray[Any] = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
-    found = fitted(tried)
-    for step in (0.02, 0.004):
-        tried = found[1] + step * np.arange(-5, 6)
-        found = fitted(tried)
-    return found
-
-
 class System(NamedTuple):
     """Normal equations of constants."""
 
@@ -500,12 +424,6 @@ def standard_errors(S: Array, scores: Array, prior: Array) -> Array:
 
 def _flat(parts: tuple[Array, Array, Array]) -> Array:
     return np.concatenate([part.ravel() for part in parts])
-
-
-def misfits(unit: Array, to: Array) -> Array:
-    """Return means (...) of (2 sin(angle / 2))^2, up to 0.04, between unit vectors (n, 3) and vectors (..., n, 3)."""
-    cosine = (to * unit).sum(axis=-1) / np.maximum(np.linalg.norm(to, axis=-1), 1e-9)
-    return np.asarray(np.minimum(2.0 - 2.0 * cosine, 0.04).mean(axis=-1))
 
 
 def deviation(rows: Array) -> float:

@@ -17,20 +17,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import DataError
-from coopenv.cars.calibration.batch import (
-    BIAS,
-    CAMERA_TIME,
-    LEVER,
-    ROT,
-    SCALE,
-    TRUTH_TIME,
-    WHEEL_TIME,
-    Batch,
-    Fit,
-    standard_errors,
-    stated_rate,
-)
+from coopenv.cars.calibration.batch import Batch, Fit, standard_errors, stated_rate
 from coopenv.cars.calibration.drives import CalibrationDrive
+from coopenv.cars.calibration.parameters import BIAS, CAMERA_TIME, LEVER, ROT, SCALE, TRUTH_TIME, WHEEL_TIME
 from coopenv.estimation.lens import PLUMB_BOB
 from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import Mask
@@ -131,16 +120,13 @@ def calibrate(drive: CalibrationDrive, truth: bool = True) -> Calibrated:
         DataError: the poses of a car are not determined.
     """
     try:
-        return _calibrated(Batch(drive, truth))
+        batch = Batch(drive, truth)
+        pairs = exchanged(batch)
+        given = batch.fit(batch.begin())
+        return _result(batch, given, corrected(batch, given), pairs)
     except np.linalg.LinAlgError as error:
         names = ", ".join(car.name for car in drive.cars)
         raise DataError(f"{names}: the drive does not determine the poses ({error})") from None
-
-
-def _calibrated(batch: Batch) -> Calibrated:
-    pairs = exchanged(batch)
-    given = batch.fit(batch.begin())
-    return _result(batch, given, corrected(batch, given), pairs)
 
 
 def corrected(batch: Batch, given: Fit, tried_most: int = TRIED, least: float = -np.inf) -> Fit:

@@ -2,25 +2,23 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from coopenv.base.errors import DataError
-from coopenv.cars.doctor.streams import CarStreams, Streams
+from coopenv.cars.doctor.streams import CarSight, CarStreams, Streams
 from coopenv.cars.messages.readings import yaw_of
 from coopenv.cars.messages.vision import Calibration, rays
 from coopenv.cars.settings.profile import Role
 from coopenv.cars.settings.sensors import Correction
 from coopenv.estimation.poses import Array, log_so3
+from coopenv.observers.recording import Recording
 from coopenv.scenario import Scenario
-
-if TYPE_CHECKING:
-    from coopenv.observers.recording import Recording
 
 NS = 1e-9
 LEAST_SIGHTINGS, LEAST_SECONDS = 50, 5.0
@@ -37,18 +35,10 @@ ROLES = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class CarDrive:
-    """Measurements of one car; times in s on one clock, planar vectors as complex numbers x + iy."""
+class CarDrive(CarSight):
+    """Measurements of one car, its camera as given; planar vectors are complex numbers x + iy."""
 
-    name: str
-    vehicle: int
-    mounting: Array  # (3, 3) camera to body, as given
-    lever: Array  # (3,) optical centre in the body, as given, m
-    lens: Calibration | None  # as given; None: bearings without pixels
-    time: Array  # (n,) of sightings
-    target: NDArray[np.int64]  # (n,) landmark
-    ray: Array  # (n, 3) unit vectors, optical frame, by the given lens
-    pixel: Array  # (n, 2); of no use without a lens
+    pixel: Array  # (m, 2) of sightings; of no use without a lens
     wheel_time: Array
     wheel: NDArray[np.complex128]  # m/s, body
     gyro_time: Array
@@ -56,7 +46,6 @@ class CarDrive:
     truth_time: Array
     truth: NDArray[np.complex128]  # m, map
     truth_yaw: Array  # rad
-    height: float  # m, of the body's origin
     topics: tuple[tuple[str, float], ...] = (("", 0.0),) * 3
     """Topics of camera, wheels and motion capture, and s that were added to their stamps."""
     gyro_added: float = 0.0  # s that were added to the stamps of turn rates, against which all offsets count
@@ -86,12 +75,8 @@ def car_of(car: CarStreams, where: str, **more: Any) -> CarDrive:
     """
     pixel = np.zeros((len(car.ray), 2)) if car.lens is None else np.round(car.lens.pixels(car.ray), 3)
     tracks = {key: value for key, value in car.tracks.items() if "command" not in key}
-    same = {key: getattr(car, key) for key in SAME}
+    same = {field.name: getattr(car, field.name) for field in fields(CarSight)}
     return _of_use(CarDrive(pixel=pixel, **tracks, **same, **more), where)
-
-
-SAME = ("name", "vehicle", "mounting", "lever", "height", "lens", "time", "target", "ray")
-"""Fields that a drive takes over."""
 
 
 def _of_use(car: CarDrive, where: str) -> CarDrive:
@@ -141,7 +126,7 @@ def _of_car(streams: Streams, car: CarStreams, where: str) -> CarDrive:
     return car_of(car, where, corrected=(right.wheel_scale, right.gyro_bias), **known)
 
 
-def drive_of_recording(recording: "Recording", path: Path) -> CalibrationDrive:
+def drive_of_recording(recording: Recording, path: Path) -> CalibrationDrive:
     """Return the drive of a log of coopenv. Raises DataError: it is not one of cars, or a car has too few sightings."""
     r = recording
     if r.scenario is None or r.pan is not None:
@@ -155,7 +140,7 @@ def drive_of_recording(recording: "Recording", path: Path) -> CalibrationDrive:
     return CalibrationDrive(cars, streamed[0].names, streamed[0].places, r.scenario)
 
 
-def streams_of_recording(recording: "Recording") -> list[CarStreams]:
+def streams_of_recording(recording: Recording) -> list[CarStreams]:
     """Return the streams of the vehicles of a recording, whose cameras do not turn.
 
     Without an environment, rays are those of the body frame.
@@ -164,7 +149,7 @@ def streams_of_recording(recording: "Recording") -> list[CarStreams]:
     return [_of_vehicle(recording, i, static) for i in range(len(recording.setups))]
 
 
-def _of_vehicle(r: "Recording", i: int, static: NDArray[np.int64]) -> CarStreams:
+def _of_vehicle(r: Recording, i: int, static: NDArray[np.int64]) -> CarStreams:
     setup, scenario, middle = r.setups[i], r.scenario, r.t[1:] - 0.5 * r.dt
     camera = None if scenario is None else scenario.cameras[i]
     mounting = np.eye(3) if camera is None else camera.to_body()

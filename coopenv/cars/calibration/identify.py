@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.stats import ks_2samp
 
 from coopenv.base.errors import DataError, check_one_of
+from coopenv.cars.bags.bag import Bag
 from coopenv.cars.calibration.batch import deviation, stated_rate
 from coopenv.cars.calibration.calibrate import ConstantRow, tables_text
 from coopenv.cars.calibration.response import DEAD_BAND, KINDS, Response, constants_of
@@ -18,9 +19,6 @@ from coopenv.cars.messages.readings import CarPose, Detections, Sample, tracks_o
 from coopenv.cars.settings.profile import Role
 from coopenv.estimation.poses import Array
 from coopenv.scenario import load_scenario
-
-if TYPE_CHECKING:
-    from coopenv.cars.bags.bag import Bag
 
 PARTS = 10  # of a drive, by whose spread measured levels have standard errors
 STEP = 0.2  # s over which changes are compared
@@ -51,7 +49,7 @@ class Identified:
     distances: tuple[Distance, ...]
 
 
-def identify(bag: "Bag", car: str | None = None) -> Identified:
+def identify(bag: Bag, car: str | None = None) -> Identified:
     """Return the fake that a car of a bag is; None: the first with commands. Raises DataError: too few commands."""
     sent = {
         name: {role: found for (of, role), found in bag.log.sent.items() if of == name} for name in bag.binding.cars
@@ -96,7 +94,7 @@ def _level(name: str, unit: str, given: float, measure: Callable[[Array], float]
     return ConstantRow(name, unit, given, measure(values), float(np.std(parts, ddof=1)) / np.sqrt(PARTS), "")
 
 
-def _noise(bag: "Bag", vehicle: int, response: Response, rest: Sequence[Array]) -> Iterator[ConstantRow]:
+def _noise(bag: Bag, vehicle: int, response: Response, rest: Sequence[Array]) -> Iterator[ConstantRow]:
     """Yield the noise of wheels and gyro, as the environment states it."""
     noise, rate = bag.scenario.noises[vehicle], stated_rate(bag.scenario, vehicle)
     for name, (time, _), left in zip(("velocity", "angular_velocity"), response.series, rest, strict=False):
@@ -105,7 +103,7 @@ def _noise(bag: "Bag", vehicle: int, response: Response, rest: Sequence[Array]) 
         yield _level(f"noise.{name}", unit, getattr(noise, name), deviation, scale * np.diff(left)[:, None])
 
 
-def _links(sent: Sent, bag: "Bag", vehicle: int) -> Iterator[ConstantRow]:
+def _links(sent: Sent, bag: Bag, vehicle: int) -> Iterator[ConstantRow]:
     """Yield rates, jitter, loss and delay of the sensors' messages, and noise and misses of the camera."""
     camera, steps, delays = bag.scenario.cameras[vehicle], [], []
     for role in SENSORS:
@@ -179,14 +177,14 @@ def _quantities(sent: Sent) -> Iterator[tuple[str, Array]]:
 
 
 def _distances(
-    bag: "Bag", car: str, rows: Sequence[ConstantRow], sent: Sent, drives: Sequence[Sample]
+    bag: Bag, car: str, rows: Sequence[ConstantRow], sent: Sent, drives: Sequence[Sample]
 ) -> Iterator[Distance]:
     """Yield how far fakes with the same commands are from the bag."""
     end = drives[0].stamp + round(COMPARED * 1e9)
     commands = [(s.stamp, s.value) for s in drives if s.stamp < end and isinstance(s.value, MotionCommand)]
     truth = (s for s in bag.log.samples if (s.car, s.role) == (car, Role.TRUTH) and s.stamp >= drives[0].stamp)
     pose = next((s.value for s in truth if isinstance(s.value, CarPose)), None)
-    shift = {role: round(bag.log.added[car, role][1] * 1e9) for role in sent}
+    shift = {role: round(bag.log.streams.added[car, role][1] * 1e9) for role in sent}
     first, last = drives[0].stamp, commands[-1][0]
     inside = {role: [s for s in sent[role] if first <= s.stamp + shift[role] < last] for role in sent}
     overrides, fake = tables(rows)

@@ -15,7 +15,8 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import least_squares
 
 from coopenv.base.errors import DataError
-from coopenv.cars.calibration.batch import LEAST_PLACE, LOSS, ParameterKind, by_stretch, deviation, standard_errors
+from coopenv.cars.calibration.batch import LEAST_PLACE, LOSS, by_stretch, deviation, standard_errors
+from coopenv.cars.calibration.parameters import ParameterKind
 from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import Mask
 from coopenv.motions.command import first_order_lag

@@ -21,9 +21,10 @@ from coopenv.base.files import replace_text
 from coopenv.cars.bags.bag import open_bags
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topics import cars_of, examined, markers_of
-from coopenv.cars.calibration.batch import BIAS, CAMERA_TIME, LATE, NUISANCE, ROT, Batch, Fit
+from coopenv.cars.calibration.batch import LATE, Batch, Fit
 from coopenv.cars.calibration.calibrate import errors
 from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive, drive_of_streams
+from coopenv.cars.calibration.parameters import BIAS, CAMERA_TIME, NUISANCE, ROT
 from coopenv.cars.settings.profile import Role
 from coopenv.cars.settings.toml import toml_text
 from coopenv.estimation.poses import Array, about_z
@@ -221,23 +222,31 @@ class Room:
         self, starts: Array, places: Mapping[str, Sequence[float]], markers: Mapping[str, int], own: Mapping[str, int]
     ) -> None:
         """Write starts (C, 3) of the cars, places of landmarks, their markers and those of cars."""
-        vehicles = dict(zip(self.cars, starts.tolist(), strict=True))
-        first = f"# Proposed from {self.title}.\n"
-        replace_text(self.files[0], first + toml_text(environment_of(self.raw, self.title, vehicles, places)))
-        replace_text(self.files[1], first + toml_text(topics_of(self.cars, markers, own)))
+        kept = ("body", "marker", "initial_estimate")
+        shared = {key: value for key, value in self.raw["vehicles"][0].items() if key in kept and value}
+        poses = [{"position": [x, y, 0.0], "yaw": yaw} for x, y, yaw in np.round(starts, 4).tolist()]
+        environment = {
+            "title": f"Drive of {self.title}",
+            "horizon": self.raw["horizon"],
+            **{name: self.raw[name] for name in KEPT if self.raw.get(name)},
+            "landmarks": [{"name": name, "position": list(place)} for name, place in places.items()],
+            "vehicles": [{"initial_pose": pose, **shared} for pose in poses],
+        }
+        rows = [
+            {"name": car, "marker": own.get(car), "topics": {role.value: topic for role, topic in topics.items()}}
+            for car, topics in self.cars.items()
+        ]
+        topics = {"environment": self.files[0].name, "names": "none", "markers": markers, "cars": rows}
+        for file, table in zip(self.files, (environment, topics), strict=True):
+            replace_text(file, f"# Proposed from {self.title}.\n{toml_text(table)}")
 
 
 def survey(bags: Sequence[Path], like: str, folder: Path, truth: bool = True) -> Survey:
     """Solve the places of all markers of a drive, and write `environment.toml` and `topics.toml` into a folder.
 
-    Args:
-        bags: of one drive.
-        like: environment whose cameras, noise and observer count.
-        folder: where the files go.
-        truth: whether motion capture counts.
+    Cameras, noise and observer are those of the environment that it is like; `truth`: whether motion capture counts.
 
-    Raises:
-        CoopenvError: a bag cannot be read, or the drive does not determine the places.
+    Raises CoopenvError: a bag cannot be read, or the drive does not determine the places.
     """
     template, title = load_scenario(like), listed([path.name for path in bags])
     with ExitStack() as stack:
@@ -389,30 +398,3 @@ def same_names(template: Scenario, numbers: Sequence[int], places: Array) -> dic
     apart = np.linalg.norm(places[:, None] - np.array([mark.position for mark in marks]), axis=-1)
     pairs = zip(*linear_sum_assignment(apart), strict=True)
     return {numbers[k]: marks[m].name for k, m in pairs if apart[k, m] < SAME}
-
-
-def environment_of(
-    raw: Mapping[str, Any], title: str, cars: Mapping[str, Sequence[float]], places: Mapping[str, Sequence[float]]
-) -> dict[str, Any]:
-    """Return an environment with the sections of another, cars as vehicles at x, y, yaw, and landmarks at places."""
-    kept = ("body", "marker", "initial_estimate")
-    shared = {key: value for key, value in raw["vehicles"][0].items() if key in kept and value}
-    starts = [{"position": [round(x, 4), round(y, 4), 0.0], "yaw": round(yaw, 4)} for x, y, yaw in cars.values()]
-    return {
-        "title": f"Drive of {title}",
-        "horizon": raw["horizon"],
-        **{name: raw[name] for name in KEPT if raw.get(name)},
-        "landmarks": [{"name": name, "position": list(place)} for name, place in places.items()],
-        "vehicles": [{"initial_pose": start, **shared} for start in starts],
-    }
-
-
-def topics_of(
-    cars: Mapping[str, Mapping[Role, str]], markers: Mapping[str, int], own: Mapping[str, int]
-) -> dict[str, Any]:
-    """Return a map of topics whose environment stands beside it."""
-    rows = [
-        {"name": car, "marker": own.get(car), "topics": {role.value: topic for role, topic in topics.items()}}
-        for car, topics in cars.items()
-    ]
-    return {"environment": "environment.toml", "names": "none", "markers": markers, "cars": rows}

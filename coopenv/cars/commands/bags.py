@@ -137,7 +137,6 @@ def doctor(
 
     from coopenv.base.errors import DataWarning
     from coopenv.cars.bags.bag import open_bags
-    from coopenv.cars.doctor.finding import Treatment
     from coopenv.report.table import Table
     from coopenv.sources.selection import Selection
 
@@ -159,7 +158,7 @@ def doctor(
             console.print(note, soft_wrap=True)
         read = [row for row in bag.log.rows if row.role]
         console.print(f"{bag.where}: {len(bag.binding.cars)} cars, {len(read)} topics", soft_wrap=True)
-    if any(finding.treatment is Treatment.REFUSED for finding in findings):
+    if bag.refused:
         raise typer.Exit(1)
 
 

@@ -5,21 +5,17 @@ import os
 import signal
 import sys
 import threading
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from math import isnan
 from pathlib import Path
-from queue import Empty, Full, Queue
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cli import arguments, commands, options
-
-if TYPE_CHECKING:
-    from coopenv.cars.link.transport import Transport
 
 in_deployment = partial(typer.Argument, metavar="DEPLOYMENT.toml", callback=arguments.existing("deployment"))
 Fleet = Annotated[Path, in_deployment(help="Deployment of the fleet.")]
@@ -262,23 +258,6 @@ def health(
     print(f"{car}: a command to its wheels from outside does not get through")
 
 
-def next_message(transport: "Transport", topic: str, kind: str, patience: float) -> Any | None:
-    """Return the next message of a topic that is of a type (None: none within s); whatever else comes is dropped."""
-    from coopenv.cars.link.transport import Arrival
-    from coopenv.cars.messages.codec import decode
-
-    received = Queue[Any](1)
-
-    def keep(arrival: Arrival) -> None:
-        with suppress(CoopenvError, Full):
-            received.put_nowait(decode(arrival.payload, kind))
-
-    transport.subscribe(topic, keep)
-    with suppress(Empty):
-        return received.get(timeout=patience)
-    return None
-
-
 @svea.command()
 def see(
     deployment: Fleet,
@@ -295,22 +274,15 @@ def see(
     from coopenv.base import interrupts
     from coopenv.cars.gate.process import gate_deployment
     from coopenv.cars.link.connect import open_transport
-    from coopenv.cars.messages.readings import read
-    from coopenv.cars.messages.see import FrameReader
-    from coopenv.cars.messages.vision import Calibration, opencv
-    from coopenv.cars.settings.profile import Role
+    from coopenv.cars.messages.see import FrameReader, published_calibration
+    from coopenv.cars.messages.vision import opencv
 
     fleet = gate_deployment(car, deployment, connect, off_board)
-    profile, topic = fleet.profile, fleet.profile.topic_of(car, Role.CAMERA_INFO)
-    if profile.sees_frames:
+    if fleet.profile.sees_frames:
         opencv()
     with closing(open_transport(fleet)) as transport:
-        info = next_message(transport, topic, profile.topics[Role.CAMERA_INFO].type, patience)
-        if info is None:
-            raise CoopenvError(f"{car}: no calibration of its camera for {patience:g} s on {topic}")
-        calibration = read(Role.CAMERA_INFO, info, vision=profile.vision)
-        assert isinstance(calibration, Calibration)
-        reader = FrameReader(car, profile, calibration, transport)
+        calibration = published_calibration(car, fleet.profile, transport, patience)
+        reader = FrameReader(car, fleet.profile, calibration, transport)
         interrupts.note(f"{car} sees no more")
         print(f"{car}: see ready at {', '.join(fleet.network.connect)}", flush=True)
         reader.run()

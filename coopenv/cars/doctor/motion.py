@@ -160,12 +160,7 @@ def velocity_relations(
     time, velocity = car.tracks["wheel_time"], car.tracks["wheel"]
     if len(time) < 2:
         return None, None
-
-    def way(velocity: NDArray[np.complex128]) -> SampledSignal:
-        parts = (SampledSignal.of_rates(time, part).values[:, 0] for part in (velocity.real, velocity.imag))
-        return SampledSignal(time, np.column_stack([*parts]))
-
-    measured = way(velocity)
+    measured = SampledSignal.of_rates(time, velocity)
     begin, end = intervals(measured, place, heading)
     middle, turn = heading.over(begin, 0.5 * (begin + end), level=True)[:, 0], heading.over(begin, end)[:, 0]
     true = _planar(place.over(begin, end))
@@ -177,7 +172,7 @@ def velocity_relations(
     def driven(lag: float) -> NDArray[np.complex128]:
         """Return the chords (n,) of the measured arcs, about the heading in their middle."""
         yaw = np.interp(time - lag, heading.times, heading.values[:, 0])
-        arc = way(velocity * np.exp(1j * yaw)).over(begin + lag, end + lag)
+        arc = SampledSignal.of_rates(time, velocity * np.exp(1j * yaw)).over(begin + lag, end + lag)
         return np.asarray(_planar(arc) * np.exp(-1j * middle))
 
     def moved(lag: float) -> NDArray[np.complex128]:

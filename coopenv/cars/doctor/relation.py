@@ -22,7 +22,6 @@ SIGNIFICANT = 6.0
 """Standard errors of a contradiction: 2e-9 of right streams exceed it if errors are normal, and 2e-4 if errors have the
 tails of Student's t with 9 degrees of freedom, as of ten blocks (20 s)."""
 
-
 GROSS = 0.5
 """Relative size of a wrong sign or unit, which a short drive shows: the least of them, 1 / 3.6, differs by 0.72."""
 

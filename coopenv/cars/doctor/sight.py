@@ -6,6 +6,7 @@ Every cause is a change of one stream. The cause counts under which bearings fit
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from typing import Any
 
@@ -15,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import listed
 from coopenv.cars.bags.clocks import CAMERAS
-from coopenv.cars.calibration.batch import misfits, seen_from
 from coopenv.cars.calibration.calibrate import INTRINSICS
 from coopenv.cars.calibration.drives import LEAST_SECONDS
+from coopenv.cars.calibration.resection import misfits, seen_from
 from coopenv.cars.doctor.finding import Change, Diagnosis, Finding, Treatment, with_error
 from coopenv.cars.doctor.streams import CarStreams, Planar
 from coopenv.cars.messages.vision import Calibration, rays
@@ -229,12 +230,8 @@ def _of_places(car: CarStreams) -> Iterator[Cause]:
         places[k] = place
         text = f"landmark {car.names[k]} stands at {_listed(place, 2)} m, {distance:.2f} m from its place on the map"
         small, parts = distance < SMALL_M, (f"marker {car.names[k]}: position",)
-        yield Cause("landmarks", text, of_places(places), distance, None, "", 3, parts, small)
-
-
-def of_places(places: Array) -> Change:
-    """Return the change to other places (L, 3) of the landmarks."""
-    return lambda car: replace(car, places=places)
+        moved = partial(replace, places=places)
+        yield Cause("landmarks", text, moved, distance, None, "", 3, parts, small)
 
 
 def _same(values: Any) -> Any:

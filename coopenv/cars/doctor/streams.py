@@ -24,12 +24,25 @@ Planar = NDArray[np.complex128]
 SMOOTH = 0.2  # s over which motion capture is differentiated
 
 
-@dataclass(frozen=True)
-class CarStreams:
-    """The streams of one car; times in s since a common start, planar vectors as complex numbers x + iy."""
+@dataclass(frozen=True, kw_only=True)
+class CarSight:
+    """What the camera of one car has seen of standing landmarks; times in s since a common start."""
 
     name: str
     vehicle: int
+    time: Array  # (m,)
+    target: NDArray[np.int64]  # (m,) landmark
+    ray: Array  # (m, 3) unit vectors, optical frame
+    lens: Calibration | None  # None: bearings without pixels
+    mounting: Array  # (3, 3) from the camera to the body
+    lever: Array  # (3,) of the camera in the body, m
+    height: float  # of the body's origin, m
+
+
+@dataclass(frozen=True, kw_only=True)
+class CarStreams(CarSight):
+    """All streams of one car; planar vectors are complex numbers x + iy."""
+
     topics: Mapping[Role, str]
     samples: Sequence[Sample]
     tracks: Mapping[str, Any]
@@ -40,18 +53,6 @@ class CarStreams:
     pose: Planar
     """Poses of the messages that hold the twists, in a frame of their own; none in most bags."""
     pose_yaw: Array
-    time: Array
-    """(m,) of sightings of standing landmarks."""
-    target: NDArray[np.int64]
-    ray: Array
-    """(m, 3) unit vectors in the optical frame."""
-    lens: Calibration | None
-    mounting: Array
-    """(3, 3) from the camera to the body."""
-    lever: Array
-    """(3,) of the camera in the body, m."""
-    height: float
-    """Of the body's origin, m."""
     places: Array
     """(L, 3) of the standing landmarks' markers, m."""
     names: tuple[str, ...]
@@ -82,15 +83,14 @@ class CarStreams:
         time, place, yaw = (self.tracks[name] for name in ("truth_time", "truth", "truth_yaw"))
         if len(time) < 2:
             return None
-        return SampledSignal(time, np.column_stack([place.real, place.imag])), SampledSignal(time, np.unwrap(yaw))
+        return SampledSignal(time, place), SampledSignal(time, np.unwrap(yaw))
 
     @property
     def own_signals(self) -> tuple[SampledSignal, SampledSignal] | None:
         """Place and heading by the poses of the odometry's own messages; None: it has none, or they never change."""
         if len(self.pose_time) < 2 or np.ptp(np.abs(self.pose - self.pose[0])) == 0.0:
             return None
-        place = np.column_stack([self.pose.real, self.pose.imag])
-        return SampledSignal(self.pose_time, place), SampledSignal(self.pose_time, self.pose_yaw)
+        return SampledSignal(self.pose_time, self.pose), SampledSignal(self.pose_time, self.pose_yaw)
 
     def with_tracks(self, **tracks: Any) -> Self:
         """Return the streams with other tracks."""

@@ -5,6 +5,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -34,39 +35,30 @@ MOST_WAITING, MOST_LINES = 256, 100
 """Messages that wait for the next turn, the oldest of more are dropped; and errors of messages that are printed."""
 
 
+@dataclass(eq=False, repr=False)
 class Fake:
     """A fake car, a vehicle or a moving landmark; `advance` runs all due events in one thread."""
 
-    def __init__(
-        self,
-        binding: Binding,
-        name: str,
-        transport: Transport,
-        *,
-        seed: int = 0,
-        differential: bool = False,
-        gate: Callable[[Transport, GateClock], GateConnection] | None = None,
-        settings: FakeSettings = USUAL,
-    ) -> None:
-        """Put the car at the start of a seed. Its gate announces it; a moving landmark announces itself.
+    binding: Binding
+    name: str
+    transport: Transport  # stays the caller's; its wall clock is that of motion capture
+    _: KW_ONLY
+    seed: int = 0  # of where it starts and of its errors, which are those of the simulation with that key
+    differential: bool = False  # the wheels measure a turn rate, because no other sensor does
+    gate: Callable[[Transport, GateClock], GateConnection] | None = None
+    """Connects a gate of its own, through which commands come; None: it obeys ManualControl on the network."""
+    settings: FakeSettings = USUAL
 
-        Args:
-            binding: vehicles and markers of the fleet's cars.
-            name: of the car.
-            transport: the network; stays the caller's. Its wall clock is that of motion capture.
-            seed: of where it starts and of its errors, which are those of the simulation with that key.
-            differential: the wheels measure a turn rate, because no other sensor does.
-            gate: connects a gate of its own, through which commands come; None: it obeys ManualControl on the network.
-            settings: differences from the environment.
-        """
-        self._settings = settings
+    def __post_init__(self) -> None:
+        """Put the car at the start of a seed. Its gate announces it; a moving landmark announces itself."""
+        binding, name, transport, settings = self.binding, self.name, self.transport, self.settings
         self._clock = clock = transport.clock
-        self.name, self._profile, self._faults = name, binding.profile, CarFaults()
+        self._profile, self._faults = binding.profile, CarFaults()
         scenario, self._drives = binding.scenario, name in binding.cars
         agent = len(scenario.landmarks) + binding.cars[name] if self._drives else binding.leaders[name]
         self.world = CarWorld(scenario, agent, frames=self._profile.sees_frames)
         self._origin = np.array(scenario.map.origin)
-        self._wire = Wire(transport, self._faults, clock.steady, seed, settings)
+        self._wire = Wire(transport, self._faults, clock.steady, self.seed, settings)
         self._inbox: deque[Callable[[], None]] = deque(maxlen=MOST_WAITING)
         self._errors = 0  # of messages
         self._others = Neighbours(self.world, binding, name, transport)
@@ -76,22 +68,22 @@ class Fake:
         acts: list[tuple[float, Act]] = [(TRUTH_RATE, self._truth)]
         if self._drives:
             self._camera = FakeCamera(self.world, binding, self._others, self._faults, self._publisher, settings)
-            self._sensors = CarSensors(self.world, self._publisher, settings, differential=differential)
+            self._sensors = CarSensors(self.world, self._publisher, settings, differential=self.differential)
             latency = scenario.limits[self.world.vehicle].latency if settings.latency is None else settings.latency
             self._wheels = Actuators(latency, self._profile.command.timeout)
             acts += [*self._camera.acts, *self._sensors.acts]
         else:
             acts.append((LEADER_RATE, self._leader))
-        self.begin(seed)
+        self.begin(self.seed)
         warm_up(self._profile)  # once what takes long at the first time: codecs and kernels are compiled, or loaded
         self._move(self._began + 1)
         if self._drives:
             self.world.look(0)
         transport.subscribe(RESET_TOPIC, self._later(self._reset))
         transport.subscribe(fault_topic(name), self._later(self._fault))
-        if self._drives and gate is not None:
+        if self._drives and self.gate is not None:
             car_clock = GateClock(lambda: clock.wall() + self._faults.clock_error(clock.steady()), clock.steady)
-            self._link = gate(self._wire, car_clock)
+            self._link = self.gate(self._wire, car_clock)
             acts.append((1e9 / PERIOD, self._tick_gate))
         elif self._drives:  # presence is the gate's, and ends with it
             transport.subscribe(self._profile.topic_of(name, Role.MANUAL), self._later(self.obey))  # on the car
@@ -143,7 +135,7 @@ class Fake:
 
     def _repeat(self, number: int, regular: float, period: float, act: Act) -> None:
         """Let something be done at a regular time, ns, jitter aside, and again after each period."""
-        due = int(regular + period * self._settings.jitter * self._phases.uniform(-1.0, 1.0))
+        due = int(regular + period * self.settings.jitter * self._phases.uniform(-1.0, 1.0))
         self._events.enterabs(due, number, self._do, (due, number, regular, period, act))
 
     def _do(self, due: int, number: int, regular: float, period: float, act: Act) -> None:
@@ -172,7 +164,7 @@ class Fake:
             self._moved = to
 
     def _drive(self, duration: float, drive: MotionCommand) -> None:
-        s, brake = self._settings, self._profile.command.brake
+        s, brake = self.settings, self._profile.command.brake
         deceleration = brake.deceleration if brake and drive.brake else s.deceleration
         speed, steering = s.speed_gain * drive.speed, s.steering_gain * drive.steering + s.steering_offset
         self.world.drive(duration, speed, steering, deceleration)
@@ -193,7 +185,7 @@ class Fake:
         """Obey the gate's command; a frozen computer sends none."""
         if self._link is not None and not self._faults.value("freeze", due):
             # The dead time of the scenario is that from a command to its effect, the gate's turn in it.
-            begin = max(self._link.commanded, due - PERIOD) if self._settings.latency is None else due
+            begin = max(self._link.commanded, due - PERIOD) if self.settings.latency is None else due
             self.obey(self._link.tick(), begin)
 
     def _later(self, act: Callable[[bytes, int], None]) -> Callback:

@@ -161,7 +161,6 @@ def _kill_all() -> None:
 
 before_a_hard_end(_kill_all)
 
-
 REST = 0.004
 """Least time (s) between two checks of the clock: events due in between run together."""
 

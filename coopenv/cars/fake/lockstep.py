@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from coopenv.cars.backend.backend import Svea, open_svea
 from coopenv.cars.fake.car import Fake
@@ -12,7 +12,7 @@ from coopenv.cars.link.clock import CLOCK, Clock, SimulatedClock
 from coopenv.cars.link.transport import Arrival, Callback, HeartbeatTransport, matcher
 from coopenv.cars.messages.see import FrameReader
 from coopenv.cars.messages.vision import Calibration
-from coopenv.cars.settings.profile import Role
+from coopenv.cars.settings.profile import Role, Way
 
 
 class Hub:
@@ -37,9 +37,7 @@ class HubTransport(HeartbeatTransport):
         self._hub, self.clock = hub, hub.clock
         self._subscribed = list[tuple[Callable[[str], bool], Callback]]()
 
-    def publish(
-        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
-    ) -> None:
+    def publish(self, topic: str, payload: bytes, attachment: bytes = b"", **way: Unpack[Way]) -> None:
         """Deliver a message."""
         arrival = Arrival(topic, payload, self.clock.wall(), attachment)
         for end in () if self._closed.is_set() else self._hub.ends:

@@ -5,6 +5,7 @@ Cameras cast rays: blocks of a Pixy and the authors' bearings, or frames with ta
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +29,6 @@ TRUTH_RATE, FILTER_RATE = 100.0, 20.0
 LEADER_RATE, CONDITION_RATE = 60.0, 5.0
 """Hz: motion capture, own filter; poses of a moving landmark, conditions of a car."""
 
-
 GRAVITY = 9.81  # m/s^2
 FULL = 0.9  # share of the battery that is left
 STANDING = {"connected": True, "armed": True, "manual_input": True, "mode": "MANUAL", "system_status": 4}
@@ -42,38 +42,41 @@ Act = Callable[[int, int], None]
 """Called with when it was due, steady clock, and the stamp by the car's clock; ns."""
 
 
+@dataclass(frozen=True)
 class SensorPublisher:
     """Publishes messages of a car on a network."""
 
-    def __init__(self, name: str, profile: CarProfile, network: Transport) -> None:
-        """Take the car's name, its make, and the network."""
-        self.name, self._profile, self._network = name, profile, network
+    name: str
+    profile: CarProfile
+    network: Transport
 
     def send(self, role: Role, stamp: int, frame: str, /, **fields: Any) -> None:
         """Publish a message by its fields, the fields of SVEA's type; a stamp in ns.
 
         Types without covariances, or without a twist, get what they have room for.
         """
-        topic = self._profile.topics[role]
+        topic = self.profile.topics[role]
         known = {name: node[1] for name, node in ros2().fielddefs[topic.type][1]}
         for name in fields.keys() & {"pose", "twist"}:
             if name in known and "WithCovariance" not in str(known[name]):
                 fields[name] = fields[name][name]
         held = {name: value for name, value in fields.items() if name in known}
         payload = encode(make(topic.type, header=header(stamp, frame), **held))
-        name = self._profile.topic_of(self.name, role)
-        self._network.publish(name, payload, urgent=topic.urgent, reliable=topic.reliable)
+        self.network.publish(self.profile.topic_of(self.name, role), payload, **topic.way)
 
 
+@dataclass(eq=False, repr=False)
 class CarSensors:
     """Odometry and condition of one car. Lasting errors are drawn by the world."""
 
-    def __init__(
-        self, world: CarWorld, publisher: SensorPublisher, settings: FakeSettings, *, differential: bool
-    ) -> None:
-        """Put them on the car of a world; `differential`: the wheels measure a turn rate, else 0."""
-        self._world, self._publisher, self._differential = world, publisher, differential
-        self._settings = settings
+    world: CarWorld
+    publisher: SensorPublisher
+    settings: FakeSettings
+    differential: bool  # the wheels measure a turn rate, else 0
+
+    def __post_init__(self) -> None:
+        """Put them on the car of the world."""
+        world, settings = self.world, self.settings
         noise = world.scenario.noises[world.vehicle]
         self._wheel_std = deviation(noise.velocity, noise, settings.wheel_rate)  # m/s, of a sample
         self._wheel_turn_std = deviation(noise.angular_velocity, noise, settings.wheel_rate)
@@ -92,33 +95,33 @@ class CarSensors:
         self._pose = np.zeros(3)  # of the filter, x and y in m and the heading in rad, from where the car began
         self._speed, self._turn_rate = 0.0, 0.0  # last samples
         self._since = 0
-        self._factor = float(self._world.view("parameter")[0, int(ODOMETRY_NOISE)])
+        self._factor = float(self.world.view("parameter")[0, int(ODOMETRY_NOISE)])
 
     def _wheel(self, due: int, stamp: int) -> None:
-        velocity, turn = self._world.twist
-        slip = self._world.view("slip")[0, self._world.vehicle]
-        drawn, fixed = self._world.view("odometry_scale")[0, self._world.vehicle], self._settings.wheel_scale
+        velocity, turn = self.world.twist
+        slip = self.world.view("slip")[0, self.world.vehicle]
+        drawn, fixed = self.world.view("odometry_scale")[0, self.world.vehicle], self.settings.wheel_scale
         scale = (1.0 + (drawn if fixed is None else fixed)) * (1.0 + slip[0])
         self._dead_reckon(due)
         noise = self._rng.normal(size=2) * self._factor * (self._wheel_std, self._wheel_turn_std)
         self._speed = float(velocity[0] * scale * math.cos(slip[1]) + noise[0])
-        turned = float(turn[2] * scale + noise[1]) if self._differential else 0.0
+        turned = float(turn[2] * scale + noise[1]) if self.differential else 0.0
         covariance = np.diag([self._wheel_std**2, 0.0, 0.0, 0.0, 0.0, self._wheel_turn_std**2])
         twist = {"twist": ((self._speed, 0.0, 0.0), (0.0, 0.0, turned)), "covariance": covariance}
-        self._publisher.send(Role.WHEEL, stamp, f"{self._publisher.name}/base_link", twist=twist)
+        self.publisher.send(Role.WHEEL, stamp, f"{self.publisher.name}/base_link", twist=twist)
 
     def _imu(self, due: int, stamp: int) -> None:
         """Publish turn rates, and the weight of a car on a plane; the IMU knows no orientation."""
-        bias = self._world.view("gyro_bias")[0, self._world.vehicle].copy()
-        if self._settings.gyro_bias is not None:
-            bias[2] = self._settings.gyro_bias
-        turn = self._world.twist[1] + bias + self._rng.normal(size=3) * self._factor * self._gyro_std
+        bias = self.world.view("gyro_bias")[0, self.world.vehicle].copy()
+        if self.settings.gyro_bias is not None:
+            bias[2] = self.settings.gyro_bias
+        turn = self.world.twist[1] + bias + self._rng.normal(size=3) * self._factor * self._gyro_std
         self._dead_reckon(due)
         self._turn_rate = float(turn[2])
         fields = {"angular_velocity": turn, "linear_acceleration": (0.0, 0.0, GRAVITY)}
         fields["angular_velocity_covariance"] = self._gyro_std**2 * np.eye(3)
         unknown = {"orientation": (0.0, 0.0, 0.0, 1.0), "orientation_covariance": [-1.0, *np.zeros(8)]}
-        self._publisher.send(Role.IMU, stamp, f"{self._publisher.name}/imu", **fields, **unknown)
+        self.publisher.send(Role.IMU, stamp, f"{self.publisher.name}/imu", **fields, **unknown)
 
     def _odometry(self, due: int, stamp: int) -> None:
         self._dead_reckon(due)
@@ -128,8 +131,8 @@ class CarSensors:
             "pose": {"pose": ((x, y, 0.0), turned)},
             "twist": {"twist": ((self._speed, 0.0, 0.0), (0.0, 0.0, self._turn_rate))},
         }
-        name = self._publisher.name
-        self._publisher.send(Role.ODOMETRY, stamp, f"{name}/odom", child_frame_id=f"{name}/base_link", **fields)
+        name = self.publisher.name
+        self.publisher.send(Role.ODOMETRY, stamp, f"{name}/odom", child_frame_id=f"{name}/base_link", **fields)
 
     def _dead_reckon(self, now: int) -> None:
         """Move the filter's pose to a time by the last samples, held and summed."""
@@ -140,9 +143,9 @@ class CarSensors:
         self._pose += (way * math.cos(middle), way * math.sin(middle), dt * self._turn_rate)
 
     def _condition(self, _due: int, stamp: int) -> None:
-        self._publisher.send(Role.STATE, stamp, "", **STANDING)
-        self._publisher.send(Role.REMOTE, stamp, "", rssi=200, channels=[1500] * 8)
-        self._publisher.send(Role.BATTERY, stamp, "", **BATTERY)
+        self.publisher.send(Role.STATE, stamp, "", **STANDING)
+        self.publisher.send(Role.REMOTE, stamp, "", rssi=200, channels=[1500] * 8)
+        self.publisher.send(Role.BATTERY, stamp, "", **BATTERY)
 
 
 def deviation(stated: float, noise: Noise, rate: float) -> float:
@@ -167,33 +170,25 @@ class Spot(NamedTuple):
     age: int = 1  # frames in a row
 
 
+@dataclass(eq=False, repr=False)
 class FakeCamera:
     """The camera of one car."""
 
-    def __init__(
-        self,
-        world: CarWorld,
-        binding: Binding,
-        others: Neighbours,
-        faults: CarFaults,
-        publisher: SensorPublisher,
-        settings: FakeSettings,
-    ) -> None:
+    world: CarWorld
+    binding: Binding
+    others: Neighbours  # which are placed for each frame
+    faults: CarFaults
+    publisher: SensorPublisher
+    settings: FakeSettings
+
+    def __post_init__(self) -> None:
         """Put it on the car.
 
-        Args:
-            world: the observed world.
-            binding: markers of the cars and of landmarks, and the make, which states what it publishes.
-            others: the other cars, which are placed for each frame.
-            faults: possible faults.
-            publisher: of its messages.
-            settings: size of the markers.
-
-        Raises:
-            CoopenvError: it publishes frames, and the extra is not installed, or the family has no such markers.
+        Raises CoopenvError: it publishes frames, and the extra is not installed, or the family has no such markers.
         """
-        self._world, self._others, self._faults, self._publisher = world, others, faults, publisher
-        self._markers, self._side = {target: marker for marker, target in binding.targets.items()}, settings.marker
+        world, binding = self.world, self.binding
+        self._markers = {target: marker for marker, target in binding.targets.items()}
+        self._side = self.settings.marker
         smallest, largest = binding.profile.markers
         self._numbers = range(smallest, largest + 1)
         self._calibration = Calibration.of(world.scenario.cameras[world.vehicle])
@@ -219,33 +214,28 @@ class FakeCamera:
 
     def _camera(self, due: int, stamp: int) -> None:
         spots = self._spots(due)
-        share = self._faults.value("wrong_stamps", due)
+        share = self.faults.value("wrong_stamps", due)
         if share and self._rng.random() < share:
             stamp += round(AHEAD * 1e9)
         begin = stamp - self._vision.late((), self._calibration.image_size[1])
         if self._renderer is None:
             blocks = [self._block(spot) for spot in spots]
-            self._publisher.send(Role.DETECTIONS, begin, "camera", objects=blocks)
-            self._publisher.send(Role.BEARINGS, stamp, "camera", bearing=self._bearings(blocks))
+            self.publisher.send(Role.DETECTIONS, begin, "camera", objects=blocks)
+            self.publisher.send(Role.BEARINGS, stamp, "camera", bearing=self._bearings(blocks))
             return
         frame = self._renderer.render(self._tags(spots), BLUR, NOISE, self._rng)
-        self._publisher.send(Role.DETECTIONS, begin, "camera", **self._fields(frame))
+        self.publisher.send(Role.DETECTIONS, begin, "camera", **self._fields(frame))
 
     def _camera_info(self, _due: int, stamp: int) -> None:
-        c = self._calibration
-        (fx, fy), (cx, cy), (width, height) = c.focal_length, c.principal_point, c.image_size
-        matrices = {"d": c.distortion, "k": (fx, 0, cx, 0, fy, cy, 0, 0, 1), "r": np.eye(3)}
-        fields = {"width": width, "height": height, "distortion_model": "plumb_bob", **matrices}
-        fields["p"] = (fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0)
-        self._publisher.send(Role.CAMERA_INFO, stamp, "camera", **fields)
+        self.publisher.send(Role.CAMERA_INFO, stamp, "camera", **self._calibration.info)
 
     def _spots(self, now: int) -> list[Spot]:
         """Take a frame at a time in ns; return its markers, the nearest first, with faults."""
-        self._others.place()
+        self.others.place()
         self._frames += 1
-        seen = {agent: ray for agent, ray in self._world.look(self._frames).items() if agent in self._markers}
+        seen = {agent: ray for agent, ray in self.world.look(self._frames).items() if agent in self._markers}
         self._ages = {agent: min(self._ages.get(agent, 0) + 1, OLDEST) for agent in seen}
-        far = np.array([max(self._world.distance(agent), self._side) for agent in seen])
+        far = np.array([max(self.world.distance(agent), self._side) for agent in seen])
         pixels, sizes = self._rolled(np.array([*seen.values()]).reshape(-1, 3), far), self._side / far
         rows = zip(seen, pixels, sizes, strict=True)
         spots = [Spot(self._markers[agent], pixel, size, self._ages[agent]) for agent, pixel, size in rows]
@@ -258,12 +248,12 @@ class FakeCamera:
         """
         pixels = self._calibration.pixels(units)
         late = self._vision.row_time * (pixels[:, 1:] - 0.5 * self._calibration.image_size[1])
-        (velocity, turn), camera = self._world.twist, self._world.scenario.cameras[self._world.vehicle]
+        (velocity, turn), camera = self.world.twist, self.world.scenario.cameras[self.world.vehicle]
         w, v = turn @ camera.to_body(), (velocity + np.cross(turn, camera.position)) @ camera.to_body()
         return self._calibration.pixels(units - late * (np.cross(w, units) + v / far[:, None]))
 
     def _with_faults(self, spots: list[Spot], now: int) -> list[Spot]:
-        faults, rng, size = self._faults, self._rng, self._calibration.image_size
+        faults, rng, size = self.faults, self._rng, self._calibration.image_size
         if faults.value("swapped_signatures", now):
             numbers = [spot.number for spot in spots]
             spots = [s._replace(number=n) for s, n in zip(spots, reversed(numbers), strict=True)]
@@ -271,7 +261,7 @@ class FakeCamera:
             doubled = [spot for spot in spots if rng.random() < share]
             spots = [*spots, *(Spot(s.number, s.pixel + np.array([3.0, 0.0]), 0.5 * s.size) for s in doubled)]
         if rate := faults.value("false_blocks", now):
-            for _ in range(rng.poisson(rate / self._world.scenario.rates.camera)):
+            for _ in range(rng.poisson(rate / self.world.scenario.rates.camera)):
                 number, pixel = int(rng.choice(self._numbers)), rng.integers(size).astype(np.float64)
                 spots = [*spots, Spot(number, pixel, self._false_width / self._calibration.focal_length[0])]
         return spots

@@ -8,9 +8,10 @@ import random
 import sched
 import signal
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from math import isinf
-from typing import Annotated
+from typing import Annotated, Unpack
 
 from pydantic import Field
 
@@ -18,7 +19,7 @@ from coopenv.base.fault_text import Fault, FaultError, FaultKind, parse_fault
 from coopenv.base.sections import Section
 from coopenv.cars.link.transport import Arrival, Callback, Transport
 from coopenv.cars.settings.limits import Number, Positive
-from coopenv.cars.settings.profile import PREFIX
+from coopenv.cars.settings.profile import PREFIX, Way
 
 Share = Annotated[float, Field(ge=0.0, lt=0.5)]
 Seconds = Annotated[float, Field(ge=0.0, le=60.0)]
@@ -123,31 +124,24 @@ class CarFaults:
         ]
 
 
+@dataclass(eq=False, repr=False)
 class Wire:
     """A transport on which messages get lost, come late, or stop, both ways; its owner calls `flush`."""
 
-    def __init__(
-        self, transport: Transport, faults: CarFaults, steady: Callable[[], int], seed: int, settings: FakeSettings
-    ) -> None:
-        """Lay it.
+    transport: Transport  # stays the caller's
+    faults: CarFaults
+    steady: Callable[[], int]  # the clock that faults go by, ns
+    seed: int  # of what is lost
+    settings: FakeSettings
 
-        Args:
-            transport: what carries the messages; stays the caller's.
-            faults: that it has.
-            steady: the clock that they go by, ns.
-            seed: of what is lost.
-            settings: that last.
-        """
-        self._settings = settings
-        self._transport, self._faults, self._steady = transport, faults, steady
-        self.announce, self.watch, self.clock = transport.announce, transport.watch, transport.clock
-        self._rng, self._late = random.Random(seed), sched.scheduler(steady, lambda _: None)
+    def __post_init__(self) -> None:
+        """Lay it."""
+        self.announce, self.watch, self.clock = self.transport.announce, self.transport.watch, self.transport.clock
+        self._rng, self._late = random.Random(self.seed), sched.scheduler(self.steady, lambda _: None)
 
-    def publish(
-        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
-    ) -> None:
+    def publish(self, topic: str, payload: bytes, attachment: bytes = b"", **way: Unpack[Way]) -> None:
         """Send, see `Transport`."""
-        self._pass_on(lambda: self._transport.publish(topic, payload, attachment, urgent=urgent, reliable=reliable))
+        self._pass_on(lambda: self.transport.publish(topic, payload, attachment, **way))
 
     def subscribe(self, pattern: str, callback: Callback) -> None:
         """Subscribe, see `Transport`."""
@@ -155,7 +149,7 @@ class Wire:
         def arrive(arrival: Arrival) -> None:
             self._pass_on(lambda: callback(arrival))
 
-        self._transport.subscribe(pattern, arrive)
+        self.transport.subscribe(pattern, arrive)
 
     def close(self) -> None:
         """Forget what is under way."""
@@ -172,7 +166,7 @@ class Wire:
         self._late.run(blocking=False)
 
     def _pass_on(self, act: Callable[[], None]) -> None:
-        now, faults, lasting = self._steady(), self._faults, self._settings
+        now, faults, lasting = self.steady(), self.faults, self.settings
         loss = max(lasting.loss, faults.value("loss", now))
         if faults.value("freeze", now) or (loss and self._rng.random() < loss):
             return

@@ -141,14 +141,7 @@ class Neighbours:
     """Places the other cars by motion capture; they are in the world from their first message on."""
 
     def __init__(self, world: CarWorld, binding: Binding, name: str, transport: Transport) -> None:
-        """Listen.
-
-        Args:
-            world: their world.
-            binding: vehicles and markers of the cars.
-            name: of the own car.
-            transport: the network.
-        """
+        """Listen to all cars but that of a name."""
         L = world.model.landmarks
         agents = {**binding.leaders, **{car: L + vehicle for car, vehicle in binding.cars.items()}}
         self._world, self._origin = world, np.array(world.scenario.map.origin)

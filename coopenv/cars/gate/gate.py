@@ -83,30 +83,19 @@ MOST_BYTES = 512  # of a message to the gate; its own have less than 300
 MOST_DIGITS = 18  # of a sequence number
 
 
+@dataclass(eq=False, repr=False)
 class Gate:
     """The gate of one car; calls from several threads are to be kept apart."""
 
-    def __init__(
-        self,
-        car: str,
-        limits: Limits,
-        clock: GateClock,
-        verifier: Verifier | None = None,
-        station: str = "station",
-        profile: CarProfile = SVEA,
-    ) -> None:
-        """Start disarmed.
+    car: str  # its name, as in its topics
+    limits: Limits
+    clock: GateClock
+    verifier: Verifier | None = None  # of the station's public key; None: nothing is signed, any station can drive it
+    station: str = "station"  # identity that may arm and command
+    profile: CarProfile = SVEA
 
-        Args:
-            car: its name, as in its topics.
-            limits: of commands.
-            clock: clocks.
-            verifier: knows the station's public key; None: nothing is signed, and any station can drive the car.
-            station: identity that may arm and command.
-            profile: make of the car.
-        """
-        self.car, self.profile = car, profile
-        self._limits, self._clock, self._verifier, self._station = limits, clock, verifier, station
+    def __post_init__(self) -> None:
+        """Start disarmed."""
         self._readers = {Role.COMMAND: self._command, Role.ARM: self._arm, Role.STOP: self._stop}
         self._counts = dict.fromkeys(Reason, 0)
         self._state = GateMode.DISARMED
@@ -116,7 +105,7 @@ class Gate:
         self._wanted: MotionCommand | None = None  # by the last valid command, while it counts
         self._offset = 0
         """Wall clock less the steady one at the last arming, ns: a clock that is set later makes no command fresh."""
-        self.commanded = self._ticked = clock.steady()
+        self.commanded = self._ticked = self.clock.steady()
         """Time of the last valid command, steady clock, ns."""
         self._output = NEUTRAL
         self._braked = 0  # until when, steady clock, ns
@@ -124,7 +113,7 @@ class Gate:
     @property
     def braking(self) -> bool:
         """True while the gate brakes the car."""
-        return self._clock.steady() < self._braked and self._wanted is None
+        return self.clock.steady() < self._braked and self._wanted is None
 
     @property
     def _still(self) -> MotionCommand:
@@ -133,7 +122,7 @@ class Gate:
     @property
     def state(self) -> GateMode:
         """The state at this instant."""
-        if self._wanted is not None and self._clock.steady() - self.commanded > TIMEOUT:
+        if self._wanted is not None and self.clock.steady() - self.commanded > TIMEOUT:
             self._come_to_a_stand(GateMode.TIMED_OUT)
         return self._state
 
@@ -154,19 +143,17 @@ class Gate:
 
     def tick(self) -> bytes:
         """Return the message for the car now; to be called every 50 ms."""
-        now = self._clock.steady()
+        now = self.clock.steady()
         if self.state is GateMode.ARMED and self._wanted is not None:
             # After a late call it is as if it had been in time: no jump.
             dt = min(now - self._ticked, PERIOD) / 1e9
             before, wanted = self._output, self._wanted
-            speed, steering = self._limits.approach(
-                (before.speed, before.steering), (wanted.speed, wanted.steering), dt
-            )
+            speed, steering = self.limits.approach((before.speed, before.steering), (wanted.speed, wanted.steering), dt)
             self._output = MotionCommand(steering, speed)
         else:
             self._output = self._still
         self._ticked = now
-        return write_drive(self._clock.wall(), self.profile.command, self._output)
+        return write_drive(self.clock.wall(), self.profile.command, self._output)
 
     def foreign(self) -> None:
         """Stop, whatever the state: the wheels got a command that this gate has not sent."""
@@ -176,13 +163,13 @@ class Gate:
     def neutral(self) -> bytes:
         """Close for good and return the message for a car that brakes or stands."""
         self._come_to_a_stand(GateMode.STOPPED)
-        return write_drive(self._clock.wall(), self.profile.command, self._still)
+        return write_drive(self.clock.wall(), self.profile.command, self._still)
 
     def status(self) -> bytes:
         """Return the GateStatus now."""
         state = self.state
         session = self._session if state in (GateMode.ARMED, GateMode.TIMED_OUT) else ""
-        about, counted = (self._clock.wall(), "", session, self.nonce, state), (self._accepted, max(self._sequence, 0))
+        about, counted = (self.clock.wall(), "", session, self.nonce, state), (self._accepted, max(self._sequence, 0))
         return write(STATUS, *about, *counted, [*self._counts], [*self._counts.values()])
 
     def _command(self, payload: bytes, attachment: bytes) -> None:
@@ -196,21 +183,21 @@ class Gate:
             raise Rejected(Reason.MALFORMED)
         if int(digits) <= self._sequence:
             raise Rejected(Reason.SEQUENCE)
-        ages = self._clock.wall() - stamp, self._clock.steady() + self._offset - stamp
+        ages = self.clock.wall() - stamp, self.clock.steady() + self._offset - stamp
         self._check(Role.COMMAND, ages, payload, attachment)
         if not all(map(math.isfinite, numbers)):
             self._come_to_a_stand(GateMode.TIMED_OUT)  # the station itself has lost its way
             raise Rejected(Reason.NOT_FINITE)
         steering, _, speed, _, _ = numbers
-        if not self._limits.permit(speed, steering):
+        if not self.limits.permit(speed, steering):
             raise Rejected(Reason.LIMITS)
         self._sequence, self._accepted = int(digits), self._accepted + 1
-        self._wanted, self.commanded = MotionCommand(steering, speed), self._clock.steady()
+        self._wanted, self.commanded = MotionCommand(steering, speed), self.clock.steady()
         self._state = GateMode.ARMED
 
     def _arm(self, payload: bytes, attachment: bytes) -> None:
         stamp, _, session, nonce, armed = read(payload, ARM)
-        self._check(Role.ARM, (self._clock.wall() - stamp,), payload, attachment)
+        self._check(Role.ARM, (self.clock.wall() - stamp,), payload, attachment)
         if not armed:
             if self.state is not GateMode.STOPPED:
                 self._come_to_a_stand(GateMode.DISARMED)
@@ -221,7 +208,7 @@ class Gate:
             raise Rejected(Reason.SESSION)
         if session != self._session:  # one that is armed again goes on counting: nothing of it comes twice
             self._session, self._sequence = session, -1
-        self._offset = self._clock.wall() - self._clock.steady()
+        self._offset = self.clock.wall() - self.clock.steady()
         self._come_to_a_stand(GateMode.ARMED)
 
     def _stop(self, payload: bytes, _attachment: bytes) -> None:
@@ -234,7 +221,7 @@ class Gate:
         Unless it is a mere time-out, earlier armings are worth nothing.
         """
         if (brake := self.profile.command.brake) and self._output.speed:
-            self._braked = self._clock.steady() + round(1e9 * abs(self._output.speed) / brake.deceleration)
+            self._braked = self.clock.steady() + round(1e9 * abs(self._output.speed) / brake.deceleration)
         self._state, self._wanted, self._output = state, None, NEUTRAL
         if state is not GateMode.TIMED_OUT:
             self.nonce = secrets.token_hex(8)
@@ -245,7 +232,7 @@ class Gate:
             raise Rejected(Reason.STALE)
         if min(ages) < -MOST_AHEAD:
             raise Rejected(Reason.FUTURE)
-        if self._verifier is None:
+        if self.verifier is None:
             return
-        if self._verifier.signer(self.profile.topic_of(self.car, role), payload, attachment) != self._station:
+        if self.verifier.signer(self.profile.topic_of(self.car, role), payload, attachment) != self.station:
             raise Rejected(Reason.SIGNATURE)

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,18 +26,17 @@ LAST_NEUTRALS = 5  # that the car gets before the gate goes
 MOST_SENT = 1200  # own commands that may be under way: a minute
 
 
+@dataclass(eq=False, repr=False)
 class GateConnection:
     """A gate and its connection; its owner calls `tick` every 50 ms, from one thread."""
 
-    def __init__(self, gate: Gate, transport: Transport, signer: Signer | None = None) -> None:
-        """Listen, and announce the car.
+    gate: Gate  # used by this connection alone
+    transport: Transport  # the caller's, which closes it
+    signer: Signer | None = None  # signs the status, as the car; None: it is not signed
 
-        Args:
-            gate: decides; used by this connection alone from now on.
-            transport: the caller's, which closes it.
-            signer: signs the status, as the car; None: it is not signed.
-        """
-        self._gate, self._transport, self._signer = gate, transport, signer
+    def __post_init__(self) -> None:
+        """Listen, and announce the car."""
+        gate, transport = self.gate, self.transport
         self._topics = {role: gate.profile.topic_of(gate.car, role) for role in Role}
         self._lock = threading.Lock()
         self._ticks = 0
@@ -55,18 +54,18 @@ class GateConnection:
         The network must pass on what this end publishes to this end as well, as Zenoh does.
         """
         # The wildcard stands for nothing: it admits messages under wildcard keys, which reach the wheels as well.
-        self._transport.subscribe(f"{self._topics[Role.MANUAL]}/**", self._guard)
+        self.transport.subscribe(f"{self._topics[Role.MANUAL]}/**", self._guard)
 
     def _guard(self, arrival: Arrival) -> None:
         payload = arrival.payload
         with self._lock:
             if self._sent.pop(payload, False):
                 return
-            self._gate.foreign()
-            answer = self._gate.tick()
+            self.gate.foreign()
+            answer = self.gate.tick()
         self.news.set()
         try:
-            harmless = read_drive(payload, self._gate.profile.command) == NEUTRAL
+            harmless = read_drive(payload, self.gate.profile.command) == NEUTRAL
         except Malformed:  # to us, perhaps not to the car
             harmless = False
         if not harmless:  # so that two gates of one car do not answer each other for ever
@@ -75,7 +74,7 @@ class GateConnection:
     def tick(self) -> bytes:
         """Send the car's command, and every 0.2 s the status; return the command."""
         with self._lock:
-            payload = self._gate.tick()
+            payload = self.gate.tick()
         self._send(Role.MANUAL, payload)
         if self._ticks % TICKS_PER_STATUS == 0:
             self.publish_status()
@@ -86,14 +85,14 @@ class GateConnection:
     def commanded(self) -> int:
         """Time of the last valid command, steady clock, ns."""
         with self._lock:
-            return self._gate.commanded
+            return self.gate.commanded
 
     def publish_status(self) -> None:
         """Send the status, and that the car has been stopped if it has."""
         self.news.clear()
         with self._lock:
-            state, status = self._gate.state, self._gate.status()
-        signature = b"" if self._signer is None else self._signer.sign(self._topics[Role.GATE], status)
+            state, status = self.gate.state, self.gate.status()
+        signature = b"" if self.signer is None else self.signer.sign(self._topics[Role.GATE], status)
         self._send(Role.GATE, status, signature)
         if state is GateMode.STOPPED:
             self._send(Role.STOP, write("?", True), self._own)
@@ -101,7 +100,7 @@ class GateConnection:
     def neutral(self) -> bool:
         """Close the gate for good and send the car a neutral command, unless it is braking; return whether it was."""
         with self._lock:
-            payload, braking = self._gate.neutral(), self._gate.braking
+            payload, braking = self.gate.neutral(), self.gate.braking
         self._send(Role.MANUAL, payload)
         return not braking
 
@@ -109,20 +108,19 @@ class GateConnection:
         if role is Role.STOP and arrival.attachment == self._own:
             return
         with self._lock:
-            before = (self._gate.state, self._gate.nonce)
-            self._gate.arrive(role, arrival.payload, arrival.attachment)
-            changed = (self._gate.state, self._gate.nonce) != before
+            before = (self.gate.state, self.gate.nonce)
+            self.gate.arrive(role, arrival.payload, arrival.attachment)
+            changed = (self.gate.state, self.gate.nonce) != before
         if changed:
             self.news.set()
 
     def _send(self, role: Role, payload: bytes, attachment: bytes = b"") -> None:
-        topic = self._gate.profile.topics[role]
         if role is Role.MANUAL:
             with self._lock:
                 self._sent[payload] = True
                 if len(self._sent) > MOST_SENT:
                     del self._sent[next(iter(self._sent))]
-        self._transport.publish(self._topics[role], payload, attachment, urgent=topic.urgent, reliable=topic.reliable)
+        self.transport.publish(self._topics[role], payload, attachment, **self.gate.profile.topics[role].way)
 
 
 def notify_systemd(state: str) -> None:

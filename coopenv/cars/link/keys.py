@@ -33,21 +33,12 @@ LONGEST_IDENTITY = 64  # characters, ASCII
 
 
 class Signer:
-    """Signs as one identity."""
+    """Signs as one identity, the name of a car or a station, ASCII, at most 64 characters."""
 
     def __init__(self, identity: str, key: Ed25519PrivateKey) -> None:
-        """Take a key.
-
-        Args:
-            identity: name of a car or a station, ASCII, at most 64 characters.
-            key: its private key.
-
-        Raises:
-            CoopenvError: the identity is none.
-        """
+        """Take a private key. Raises CoopenvError: the identity is none."""
         check_identity(identity, "identity")
-        self.identity = identity
-        self._key = key
+        self.identity, self._key = identity, key
 
     def sign(self, topic: str, payload: bytes) -> bytes:
         """Return the attachment of a message: the length of the identity (1 byte), the identity, 64 bytes."""

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
-from typing import Any
+from typing import Any, Unpack
 
 from coopenv.base.installation import install_command, needing
 from coopenv.cars.link.transport import (
@@ -22,6 +22,7 @@ from coopenv.cars.link.transport import (
     first_trouble,
     matcher,
 )
+from coopenv.cars.settings.profile import Way
 
 ATTACHMENT = "Coopenv-Attachment"
 """Header, base64; the authors' connector looks at no headers."""
@@ -126,14 +127,13 @@ class Nats(HeartbeatTransport):
                         await self._post(letter)
             await self._client.close()
 
-    def publish(
-        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
-    ) -> None:
+    def publish(self, topic: str, payload: bytes, attachment: bytes = b"", **way: Unpack[Way]) -> None:
         """Send, see `Transport`."""
         if self._closed.is_set():
             return
+        reliable = way.get("reliable", False)
         patience = PATIENCE if reliable and threading.current_thread() is not self._thread else 0.0
-        self._outbox.put((topic, payload, attachment), urgent=urgent or reliable, patience=patience)
+        self._outbox.put((topic, payload, attachment), urgent=reliable or way.get("urgent", False), patience=patience)
         self._call(self._wake.set)
 
     def _call(self, act: Callable[[], object]) -> None:

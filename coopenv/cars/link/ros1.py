@@ -20,7 +20,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from http.client import HTTPConnection
-from typing import Any
+from typing import Any, Unpack
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import needing
@@ -38,7 +38,7 @@ from coopenv.cars.link.transport import (
 )
 from coopenv.cars.messages.codec import cdr_of, decode, encode, make, ros1, ros1_of
 from coopenv.cars.settings.deployment import Car, DeploymentError
-from coopenv.cars.settings.profile import AUTHORS, SVEA, CarProfile, Role
+from coopenv.cars.settings.profile import AUTHORS, SVEA, CarProfile, Role, Way
 
 PER_PERCENT = 1.27  # of the whole numbers of lli_ctrl
 DEAD_BAND = 15.0  # % of the speed controller's range about zero in which the wheels do not turn
@@ -129,17 +129,15 @@ class Authors:
             if route.exact:
                 cdr_of(translated, route.theirs)
 
-    def publish(
-        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
-    ) -> None:
+    def publish(self, topic: str, payload: bytes, attachment: bytes = b"", **way: Unpack[Way]) -> None:
         """Send, see `Transport`."""
         route = self._routes.get(topic)
         if route is None or not route.exact:
-            self._wire.publish(topic, payload, attachment, urgent=urgent, reliable=reliable)
+            self._wire.publish(topic, payload, attachment, **way)
         if route is not None:
             with suppress(CoopenvError):  # no message of its topic's type, which goes no further
                 beside = attachment if route.exact else b""
-                self._wire.publish(route.name, route.out(payload), beside, urgent=urgent, reliable=reliable)
+                self._wire.publish(route.name, route.out(payload), beside, **way)
 
     def subscribe(self, pattern: str, callback: Callback) -> None:
         """Subscribe, see `Transport`."""
@@ -292,16 +290,14 @@ class Ros1(HeartbeatTransport):
         self._beats = 0
         threading.Thread(target=self._beat_on, name="ros1", daemon=True).start()
 
-    def publish(
-        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
-    ) -> None:
+    def publish(self, topic: str, payload: bytes, attachment: bytes = b"", **way: Unpack[Way]) -> None:
         """Send, see `Transport`."""
         if self._closed.is_set():
             return
         with suppress(Exception):  # whatever keeps it from being sent, it is lost
             message = self._kind(topic)()
             message._buff = payload if topic in self._types else sealed(payload, attachment)
-            self._publisher(topic, reliable).publish(message)
+            self._publisher(topic, way.get("reliable", False)).publish(message)
 
     def _kind(self, topic: str) -> Any:
         return raw_type(self._types.get(topic, ENVELOPE))

@@ -16,13 +16,14 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Protocol, Self, Unpack
 
 from pydantic import model_validator
 
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.base.sections import Section
 from coopenv.cars.link.clock import CLOCK, Clock
+from coopenv.cars.settings.profile import Way
 
 
 class LinkError(CoopenvError):
@@ -55,9 +56,7 @@ class Transport(Protocol):
     clock: Clock
     """Of this end, for times of reception and ages."""
 
-    def publish(
-        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
-    ) -> None:
+    def publish(self, topic: str, payload: bytes, attachment: bytes = b"", **way: Unpack[Way]) -> None:
         """Send a message to its subscribers; a message that cannot be sent is lost, nothing is raised."""
         ...
 
@@ -86,9 +85,7 @@ class ReceivingTransport:
         self.subscribe, self.watch, self.close = transport.subscribe, transport.watch, transport.close
         self.clock = transport.clock
 
-    def publish(
-        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
-    ) -> None:
+    def publish(self, topic: str, payload: bytes, attachment: bytes = b"", **way: Unpack[Way]) -> None:
         """Send nothing."""
 
     def announce(self, name: str) -> None:

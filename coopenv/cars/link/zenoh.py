@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 from weakref import WeakSet
 
 from coopenv.base.errors import CoopenvError
@@ -24,6 +24,7 @@ from coopenv.cars.link.transport import (
     address_of,
     first_trouble,
 )
+from coopenv.cars.settings.profile import Way
 
 LEASE = 1000  # ms after which a process that has frozen no longer counts as present
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
@@ -38,9 +39,7 @@ class Zenoh:
         self._kept: list[Any] = []  # a declaration ends with its last reference
         _sessions().add(self)
 
-    def publish(
-        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
-    ) -> None:
+    def publish(self, topic: str, payload: bytes, attachment: bytes = b"", **way: Unpack[Way]) -> None:
         """Send, see `Transport`."""
         z = self.library
         with suppress(z.ZError):  # the session is closed
@@ -48,9 +47,9 @@ class Zenoh:
                 topic,
                 payload,
                 attachment=attachment or None,
-                express=urgent,
-                priority=z.Priority.REAL_TIME if urgent else z.Priority.DATA,
-                congestion_control=z.CongestionControl.BLOCK if reliable else z.CongestionControl.DROP,
+                express=way.get("urgent", False),
+                priority=z.Priority.REAL_TIME if way.get("urgent") else z.Priority.DATA,
+                congestion_control=z.CongestionControl.BLOCK if way.get("reliable") else z.CongestionControl.DROP,
             )
 
     def subscribe(self, pattern: str, callback: Callback) -> None:
@@ -138,7 +137,11 @@ def open_zenoh(
         if (protocol in SECURE) != (tls is not None) and protocol != UNIX and config is None:
             raise CoopenvError(f"{endpoint}: tls/... and certificates (tls) go together")
     zenoh = library()
-    made = _read_config(config) if config else zenoh.Config()
+    try:
+        made = zenoh.Config.from_file(config) if config else zenoh.Config()
+    except zenoh.ZError as error:
+        reason = " ".join(str(error).split(" at /")[0].split())
+        raise CoopenvError(f"{config}: no configuration of Zenoh: {reason}") from None
     entries: dict[str, Any] = {"connect/endpoints": list(connect), "listen/endpoints": list(listen)}
     if config is None:
         entries |= {
@@ -163,11 +166,3 @@ def open_zenoh(
         text = f"no answer within {timeout:g} s" if connect and "Timeout" in text else text
         reason = first_trouble(connect, tls.context() if tls else None, text)
         raise LinkError(f"{where}: no Zenoh there ({reason})") from None
-
-
-def _read_config(path: Path) -> Any:
-    try:
-        return library().Config.from_file(path)
-    except library().ZError as error:
-        reason = " ".join(str(error).split(" at /")[0].split())
-        raise CoopenvError(f"{path}: no configuration of Zenoh: {reason}") from None

@@ -161,7 +161,6 @@ def tags(
 
 LONGEST_MODE = 64  # characters
 
-
 LENSES = {"plumb_bob": 5, "": 5, "rational_polynomial": 8, "equidistant": 4, "fisheye": 4}
 """Coefficients by the name of the model; missing ones are 0."""
 

@@ -4,7 +4,8 @@ import sys
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
-from queue import Empty, Queue
+from dataclasses import dataclass
+from queue import Empty, Full, Queue
 from typing import Any
 
 from coopenv.base.errors import CoopenvError
@@ -24,27 +25,50 @@ def object_bearings(markers: Iterable[int], rays: Iterable[Iterable[float]]) -> 
     return [make(kind, id=n, bearing_x=-x, bearing_y=-y, bearing_z=-z) for n, x, y, z in rows]
 
 
+def next_message(transport: Transport, topic: str, kind: str, patience: float) -> Any | None:
+    """Return the next message of a topic that is of a type (None: none within s); whatever else comes is dropped."""
+    received = Queue[Any](1)
+
+    def keep(arrival: Arrival) -> None:
+        with suppress(CoopenvError, Full):
+            received.put_nowait(decode(arrival.payload, kind))
+
+    transport.subscribe(topic, keep)
+    with suppress(Empty):
+        return received.get(timeout=patience)
+    return None
+
+
+def published_calibration(car: str, profile: CarProfile, transport: Transport, patience: float) -> Calibration:
+    """Return the calibration that a car's camera publishes. Raises CoopenvError: none comes in s, or none of use."""
+    topic = profile.topic_of(car, Role.CAMERA_INFO)
+    info = next_message(transport, topic, profile.topics[Role.CAMERA_INFO].type, patience)
+    if info is None:
+        raise CoopenvError(f"{car}: no calibration of its camera for {patience:g} s on {topic}")
+    calibration = read(Role.CAMERA_INFO, info, vision=profile.vision)
+    assert isinstance(calibration, Calibration)
+    return calibration
+
+
 MOST_REASONS = 100  # that are counted; errors quote what a message holds
 
 
+@dataclass(eq=False, repr=False)
 class FrameReader:
     """Publishes the bearings of tags in frames, the newest first; frames that come in the meantime are left out."""
 
-    def __init__(self, car: str, profile: CarProfile, calibration: Calibration, transport: Transport) -> None:
-        """Subscribe to the frames of a car.
+    car: str
+    profile: CarProfile  # whose detections are frames
+    calibration: Calibration
+    transport: Transport  # stays the caller's
 
-        Args:
-            car: its name.
-            profile: of its make, whose detections are frames.
-            calibration: of its camera.
-            transport: the network; stays the caller's.
-        """
-        self._car, self._profile, self._calibration, self._transport = car, profile, calibration, transport
-        self._topics = {role: profile.topic_of(car, role) for role in (Role.DETECTIONS, Role.BEARINGS)}
+    def __post_init__(self) -> None:
+        """Subscribe to the frames of the car."""
+        self._topics = {role: self.profile.topic_of(self.car, role) for role in (Role.DETECTIONS, Role.BEARINGS)}
         self._newest = Queue[Arrival](1)
         self.counts = Counter[str]()
         """Frames that were `read` or `left out`, and the others by the reason for which they are not used."""
-        transport.subscribe(self._topics[Role.DETECTIONS], self._keep)
+        self.transport.subscribe(self._topics[Role.DETECTIONS], self._keep)
 
     def _keep(self, arrival: Arrival) -> None:
         with suppress(Empty):
@@ -68,15 +92,15 @@ class FrameReader:
             return
         self.counts[reason] += 1
         if self.counts[reason] == 1:
-            print(f"{self._car}: {line}", file=sys.stderr, flush=True)
+            print(f"{self.car}: {line}", file=sys.stderr, flush=True)
 
     def publish(self, arrival: Arrival) -> None:
         """Publish the bearings of a frame, stamped with the middle of its exposure. Raises CoopenvError: it is none."""
-        message = decode(arrival.payload, self._profile.topics[Role.DETECTIONS].type)
-        found = read(Role.DETECTIONS, message, self._calibration, vision=self._profile.vision)
+        message = decode(arrival.payload, self.profile.topics[Role.DETECTIONS].type)
+        found = read(Role.DETECTIONS, message, self.calibration, vision=self.profile.vision)
         assert isinstance(found, Detections)
-        topic, entries = self._profile.topics[Role.BEARINGS], object_bearings(found.markers, found.bearings.tolist())
+        topic, entries = self.profile.topics[Role.BEARINGS], object_bearings(found.markers, found.bearings.tolist())
         about = header(stamp_of(message) + found.late, message.header.frame_id)
         payload = encode(make(topic.type, header=about, bearing=entries))
-        self._transport.publish(self._topics[Role.BEARINGS], payload, urgent=topic.urgent, reliable=topic.reliable)
+        self.transport.publish(self._topics[Role.BEARINGS], payload, **topic.way)
         self.counts["read"] += 1

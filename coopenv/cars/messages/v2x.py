@@ -6,7 +6,7 @@ import numpy as np
 
 from coopenv.cars.messages.codec import header, make, pose
 from coopenv.cars.messages.readings import CarPose
-from coopenv.estimation.poses import Array, left_covariance, skew
+from coopenv.estimation.poses import Array, Coordinates, covariance_in_map, skew
 from coopenv.observers.contract import Message
 from coopenv.observers.robust.messages import from_six
 from coopenv.sources.base import VehicleBroadcast
@@ -35,15 +35,9 @@ def estimate_message(sent: VehicleBroadcast, stamp: int, origin: Array) -> Any:
 
     `origin` (3,) is that of the map in the coordinates of the scenario's file, which are those on the wire.
     """
-    P = left_covariance(sent.rotation.T @ sent.position, sent.covariance)
-    turn = np.zeros((6, 6))
-    turn[:3, 3:] = turn[3:, :3] = sent.rotation  # (theta, rho) in the body to (position, rotation) in the map
-    placed, covariance = pose(sent.rotation, sent.position + origin), turn @ P @ turn.T
-    return make(
-        "geometry_msgs/msg/PoseWithCovarianceStamped",
-        header=header(stamp, "map"),
-        pose={"pose": placed, "covariance": covariance},
-    )
+    covariance = covariance_in_map(Coordinates.RICCATI, sent.rotation, sent.position, sent.covariance)
+    placed = {"pose": pose(sent.rotation, sent.position + origin), "covariance": covariance}
+    return make("geometry_msgs/msg/PoseWithCovarianceStamped", header=header(stamp, "map"), pose=placed)
 
 
 def report_message(sent: VehicleBroadcast, stamp: int, origin: Array) -> Any | None:

@@ -38,6 +38,13 @@ class Calibration:
         flat = distort(points[:, :2] / points[:, 2:], self.distortion)
         return np.asarray(flat * self.focal_length + np.asarray(self.principal_point))
 
+    @property
+    def info(self) -> dict[str, Any]:
+        """Fields of its CameraInfo, but for the header."""
+        (width, height), (fx, fy), (cx, cy) = self.image_size, self.focal_length, self.principal_point
+        matrices = {"k": (fx, 0, cx, 0, fy, cy, 0, 0, 1), "r": np.eye(3), "p": (fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0)}
+        return {"width": width, "height": height, "distortion_model": "plumb_bob", "d": self.distortion, **matrices}
+
 
 def rays(pixels: Array, calibration: Calibration) -> tuple[Array, NDArray[np.bool_]]:
     """Return the rays of pixels.
@@ -135,7 +142,6 @@ def opencv() -> Any:
 
 FORMATS = {"JPEG": b"\xff\xd8\xff", "PNG": b"\x89PNG\r\n\x1a\n"}
 """First bytes of the compressed images that are decoded, as ROS has no others."""
-
 
 ENCODINGS = {
     **dict.fromkeys(("mono8", "8UC1"), (1, "u1", "GRAY2{}")),

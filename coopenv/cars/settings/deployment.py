@@ -191,7 +191,6 @@ def refuse_repeated(cars: Sequence[Car], markers: Mapping[str, int], numbers: tu
 
 LIMITED = ("speed", "steering", "acceleration", "steering_rate")
 
-
 LAG = 0.1
 """Allowance (s) for the period of the gate and the lags of a car."""
 ROLLING = 1.0

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypedDict
 
 from pydantic import Field, model_validator
 
@@ -78,6 +78,13 @@ TopicPattern = Annotated[
 ]
 
 
+class Way(TypedDict, total=False):
+    """Way of a message; what is not given is False."""
+
+    urgent: bool  # it goes at once and before others
+    reliable: bool  # its sender waits for the network instead of losing it
+
+
 class Topic(Section):
     """A topic of a car."""
 
@@ -99,6 +106,11 @@ class Topic(Section):
     def max_age_ns(self) -> int:
         """Age above which a message is not used, ns; 0 without one."""
         return round(1e9 * (self.max_age or 0.0))
+
+    @property
+    def way(self) -> Way:
+        """Way of its messages, as transports take it."""
+        return {"urgent": self.urgent, "reliable": self.reliable}
 
 
 MOST_CHANNELS = 18

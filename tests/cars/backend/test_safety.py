@@ -267,7 +267,7 @@ def test_repeated_old_and_malformed_states_of_a_gate_are_dropped(yard: Yard) -> 
 
 
 def test_a_gate_that_does_not_open_is_reported_with_the_reason(yard: Yard) -> None:
-    yard.links["b"]._gate._check = refuse  # type: ignore[method-assign]
+    yard.links["b"].gate._check = refuse  # type: ignore[method-assign]
     with pytest.raises(CoopenvError, match=r"b: its gate refuses this end's signature: .*--station"):
         yard.gates.begin()
     yard.publish()

@@ -302,8 +302,8 @@ def test_corrections_replace_the_published_calibration(tmp_path: Path) -> None:
     )
     given = [*short(), info]
     plain, bag = opened(tmp_path, MAP, given), opened(tmp_path / "new", MAP + lines + "gyro_bias = 0.5\n", given)
-    lens = replace(plain.log.lenses["svea3"], focal_length=(200.0, 201.0), distortion=(0.1, 0.0, 0.0, 0.0))
-    assert bag.log.lenses["svea3"] == lens and lens.principal_point == (160.0, 100.0)
+    lens = replace(plain.log.streams.lenses["svea3"], focal_length=(200.0, 201.0), distortion=(0.1, 0.0, 0.0, 0.0))
+    assert bag.log.streams.lenses["svea3"] == lens and lens.principal_point == (160.0, 100.0)
     pairs = [(a.value, b.value) for a, b in zip(plain.log.samples, bag.log.samples, strict=True)]
     twists = [(a, b) for a, b in pairs if isinstance(a, Twist) and isinstance(b, Twist)]
     for a, b in twists:
@@ -321,7 +321,7 @@ def test_a_lead_of_a_topic_holds_for_any_clock_of_its_car(tmp_path: Path) -> Non
         gaps = [s.stamp - bags.BEGIN for s in bag.log.samples if isinstance(s.value, Twist)]
         at = [m.stamp for m in short() if m.topic == twist]
         assert_allclose(gaps, at, atol=2e6)
-        assert bag.log.added["svea3", Role.WHEEL][1] == pytest.approx(lead - ahead, abs=2e-3)
+        assert bag.log.streams.added["svea3", Role.WHEEL][1] == pytest.approx(lead - ahead, abs=2e-3)
 
 
 def test_motion_capture_far_from_the_map_is_warned_of(tmp_path: Path) -> None:
@@ -341,7 +341,7 @@ def test_an_uncalibrated_camera_has_the_calibration_of_the_environment(tmp_path:
     info = bags.Message("/agent8/pixy_node/camera_info", "sensor_msgs/msg/CameraInfo", 0, 0, fields)
     with pytest.warns(DataWarning, match=r"camera_info: says that the camera is not calibrated \(k is zero\)"):
         bag = opened(tmp_path / "with", MAP, [*short(), info], "mcap")
-    assert bag.log.lenses == opened(tmp_path / "without", MAP, short(), "mcap").log.lenses
+    assert bag.log.streams.lenses == opened(tmp_path / "without", MAP, short(), "mcap").log.streams.lenses
 
 
 def test_a_clock_that_was_set_leaves_a_gap_that_is_named(tmp_path: Path) -> None:

@@ -22,7 +22,6 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
 from coopenv.cars.backend.station import Gates
-from coopenv.cars.commands.svea import next_message
 from coopenv.cars.fake.fleet import FakesError, free_port
 from coopenv.cars.fake.fleet import fakes as fake_processes
 from coopenv.cars.fake.lockstep import Hub
@@ -33,6 +32,7 @@ from coopenv.cars.link.transport import Arrival
 from coopenv.cars.link.zenoh import open_zenoh
 from coopenv.cars.messages.cdr import write
 from coopenv.cars.messages.codec import MOST_BYTES, encode, make
+from coopenv.cars.messages.see import next_message
 from coopenv.cars.settings.deployment import DeploymentError, Safety, load_deployment
 from coopenv.cars.settings.limits import Limits
 from coopenv.cars.settings.profile import SVEA, Role, presence_of

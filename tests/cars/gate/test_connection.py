@@ -56,7 +56,7 @@ def test_news_is_sent_at_once_and_its_own_stops_do_not_stop_it_again() -> None:
     link.publish_status()
     assert station.status.state == "stopped" and len(station.stops) == 2 and not link.news.is_set()
     repeated: list[tuple[bytes, bytes]] = []
-    link._transport.subscribe(SVEA.topic_of(CAR, Role.STOP), lambda a: repeated.append((a.payload, a.attachment)))
+    link.transport.subscribe(SVEA.topic_of(CAR, Role.STOP), lambda a: repeated.append((a.payload, a.attachment)))
     link.publish_status()
     station.send(Role.ARM, messages.arm(time.time_ns(), "s", station.status.nonce))
     station.send_raw(Role.STOP, *repeated[0])  # on its way since before the arming
@@ -89,14 +89,14 @@ def test_another_arming_of_an_armed_gate_is_news() -> None:
 def test_a_command_of_another_to_the_wheels_stops_the_car(payload: bytes, answers: int) -> None:
     link, station = pair()
     link.guard()
-    station.send(Role.ARM, messages.arm(time.time_ns(), "s", link._gate.nonce))
+    station.send(Role.ARM, messages.arm(time.time_ns(), "s", link.gate.nonce))
     sent = [link.tick() for _ in range(5)]
-    assert station.status.state == "armed" and link._gate.state is GateMode.ARMED, "its own are no others"
-    nonce, wheels = link._gate.nonce, list[bytes]()
-    link._transport.subscribe(SVEA.topic_of(CAR, Role.MANUAL), lambda arrival: wheels.append(arrival.payload))
+    assert station.status.state == "armed" and link.gate.state is GateMode.ARMED, "its own are no others"
+    nonce, wheels = link.gate.nonce, list[bytes]()
+    link.transport.subscribe(SVEA.topic_of(CAR, Role.MANUAL), lambda arrival: wheels.append(arrival.payload))
     for command, count in ((payload, 1), (sent[1], 2)):  # a repetition of its own is not its own
         station.send(Role.MANUAL, command)
-        assert link._gate.state is GateMode.STOPPED and link._gate.nonce != nonce and link.news.is_set()
+        assert link.gate.state is GateMode.STOPPED and link.gate.nonce != nonce and link.news.is_set()
         link.publish_status()
         assert (station.status.state, station.count("foreign")) == ("stopped", count)
     assert len(wheels) == 2 + answers and station.since()[-1] == NEUTRAL
