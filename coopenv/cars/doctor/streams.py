@@ -26,7 +26,7 @@ SMOOTH = 0.2  # s over which motion capture is differentiated
 
 @dataclass(frozen=True, kw_only=True)
 class CarSight:
-    """What the camera of one car has seen of standing landmarks; times in s since a common start."""
+    """Sights of standing landmarks by the camera of one car; times in s since a common start."""
 
     name: str
     vehicle: int
