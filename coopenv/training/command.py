@@ -226,7 +226,7 @@ def _notes(trainer: Trainer, course: Course) -> Iterator[str]:
     if status.share < 1.0:
         spent = f"{status.steps:,} of {settings.steps:,} steps"
         yield f"Stopped by --minutes {settings.minutes:g} after {spent}: another load gives another agent"
-    if course.curve and (steps := course.best_row["steps"]) < status.steps:
+    if course.curve and settings.evaluation.keep == "best" and (steps := course.best_row["steps"]) < status.steps:
         yield f"Kept: the policy after {steps:,} steps, the best in the worlds for validation"
 
 
@@ -257,7 +257,7 @@ def _learn(trainer: Trainer, course: Course, report: Reports, judge: Judge, keep
         means = figures_of(judge(trainer.mean_action, f"{status.steps:,} steps", seeds))
         trainer.record(means)
         course.curve.append({"steps": status.steps, "seconds": round(status.seconds, 1), **means})
-        if course.best_row is course.curve[-1]:
+        if evaluation.keep == "last" or course.best_row is course.curve[-1]:
             course.best = trainer.tensors()
 
     if trainer.status.steps == 0:

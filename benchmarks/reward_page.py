@@ -1,0 +1,162 @@
+"""The page of the comparison of rewards: tables, figure, and the sentences that intervals decide."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from coopenv.base.errors import listed
+from coopenv.report.table import markdown
+from coopenv.viz import style
+
+Cell = tuple[float, float, float]
+"""A figure or difference and the ends of its 95 % interval."""
+Document = Mapping[str, Any]
+"""The contents of `rewards.json`."""
+
+FIGURES = {
+    "mean_m": ("mean error [cm]", 100.0, 1),
+    "e95_m": ("e95 [cm]", 100.0, 0),
+    "arrival_rate": ("arrived [%]", 100.0, 0),
+    "collision_rate": ("collided [%]", 100.0, 0),
+    "return": ("return without the term", 1.0, 1),
+}
+"""Columns of the tables: heading, factor and decimals of each figure."""
+LOOKS = ((style.BLUE, "o"), (style.VERMILION, "s"), (style.GREEN, "^"), (style.PURPLE, "D"))
+
+PAGE = """# Rewards for localisation
+
+Does a [reward for localisation](../terms.md#rewards-for-localisation) pay, and which? {seeds} seeds of PPO per arm, in
+{count} environments with several cars. The arms differ in one term of the reward alone:
+
+{arms}
+
+Every arm continues the same agent, `start`: a clone of `route_follower`. It drives {steps:,} decisions of vehicles in
+the same worlds, with the same network and a discount by the horizon, and its last policy is judged. The rest of the
+reward (progress, arrival, time, losses) is that of the environment. A collision or a lost route costs arrivals in
+`plain`, too.
+
+A term's weight follows from one rule: the standard deviation of its discounted return equals that of the rest of the
+reward. The deviation is that between draws of exploration of `start` in the same world (tuning worlds).
+`truth` has the same form as `covariance`, with the true error in the place of the standard deviation: their difference
+is due to the covariance as a measure of the error.
+
+## Answer
+
+{verdict}
+
+![Differences from `plain` in the mean error and in the return without the term, with intervals](rewards.png)
+
+## Figures
+
+Means over seeds in {worlds} held-out worlds of block {block}, with 95 % intervals (bootstrap over worlds and seeds).
+The mean error and e95 are those of the position from 3 s on; a lost vehicle counts as 1 m, which is the largest error.
+The return is the sum of the reward of a vehicle without the term. `peek` is a scripted driver that steers towards
+landmarks.
+
+{values}
+
+The same figures minus those of `{base}` in the same worlds. The last column is the mean error minus that of `{second}`:
+
+{differences}
+
+## Limits
+
+- A percentile interval of {seeds} seeds is about a tenth too narrow. {tests} differences of the mean error are tested, so
+  an interval that hardly excludes 0 is weak evidence.
+- One size of the weights, one start, one discount and {steps:,} decisions: learning has not converged, and a term that
+  learns faster looks better than a term that learns more.
+- For speed, cameras have 10 Hz, odometry 20 Hz and decisions 5 Hz in all arms.
+
+```
+for ENV in {places}; do
+  coopenv train $ENV --settings agents/reward_start.toml --seed 1 --out out/reward/start/$ENV
+done
+python -m benchmarks.reward --weights                    # the weights in agents/reward_train.toml
+python -m benchmarks.reward --page docs/environments     # trains what is missing, and writes this page
+```
+"""
+
+
+def page(document: Document) -> str:
+    """Return the page in Markdown."""
+    places, terms = list(document["weights"]), document["terms"]
+    rows = [
+        [f"`{arm}`", f"`{term}`" if term else "none", *(f"{document['weights'][p][arm]:g}" if term else "" for p in places)]
+        for arm, term in terms.items()
+    ]
+    values, differences = tables(document).split("\n\n")
+    base, second, *_ = terms
+    return PAGE.format(
+        **{name: document[name] for name in ("seeds", "steps", "worlds", "block")},
+        count=len(places),
+        places=" ".join(places),
+        arms=markdown(["arm", "term", *(f"weight in `{place}`" for place in places)], rows),
+        verdict="\n".join(f"- {sentence}" for sentence in verdict(document)),
+        values=values,
+        differences=differences,
+        base=base,
+        second=second,
+        tests=len(terms) * len(places) - len(places),
+    )
+
+
+def tables(document: Document) -> str:
+    """Return the table of figures and the table of differences, in Markdown, with an empty line between them."""
+    base, second, *_ = document["terms"]
+    values, differences = [], []
+    for place, rows in document["figures"].items():
+        for row, own in rows.items():
+            names = [f"`{place}`" if place in document["weights"] else place, f"`{row}`"]
+            values.append([*names, *(text(name, own[name]["value"]) for name in FIGURES)])
+            if row in document["terms"] and row != base:
+                more = text("mean_m", own["mean_m"][second]) if row != second else ""
+                differences.append([*names, *(text(name, own[name][base]) for name in FIGURES), more])
+    heads = ["environment", "arm", *(heading for heading, *_ in FIGURES.values())]
+    return "\n\n".join([markdown(heads, values), markdown([*heads, f"minus `{second}` [cm]"], differences)])
+
+
+def text(name: str, cell: Cell) -> str:
+    """Return a figure or difference with its interval."""
+    _, factor, digits = FIGURES[name]
+    value, low, high = (f"{factor * each:.{digits}f}".replace("-0.0", "0.0") for each in cell)
+    return f"{value} [{low}, {high}]"
+
+
+def verdict(document: Document) -> Iterator[str]:
+    """Yield a sentence for each arm and figure: in which environments its interval is below, above or around 0."""
+    base, *arms = document["terms"]
+    for arm in arms:
+        for name, subject in (("mean_m", "the mean error"), ("return", "the return without the term")):
+            groups: dict[str, list[str]] = {"falls": [], "rises": [], "does not change clearly": []}
+            for place, rows in document["figures"].items():
+                _, low, high = cell = rows[arm][name][base]
+                change = "falls" if high < 0.0 else "rises" if low > 0.0 else "does not change clearly"
+                where = f"`{place}`" if place in document["weights"] else f"the {place}"
+                groups[change].append(f"{where} ({text(name, cell)}{' cm' if name == 'mean_m' else ''})")
+            parts = (f"{change} in {listed(places)}" for change, places in groups.items() if places)
+            yield f"`{arm}`: {subject} {', and '.join(parts)}."
+
+
+def draw(document: Document, path: Path) -> Path:
+    """Draw the differences from the first arm in mean error and return, with intervals, by environment and arm."""
+    base, *arms = document["terms"]
+    figure = style.new_figure(8.4, 3.6)
+    for ax, name in zip(figure.subplots(1, 2, sharey=True), ("mean_m", "return"), strict=True):
+        _, factor, _ = FIGURES[name]
+        for k, rows in enumerate(document["figures"].values()):
+            for i, (arm, (colour, marker)) in enumerate(zip(arms, LOOKS, strict=False)):
+                value, low, high = (factor * each for each in rows[arm][name][base])
+                y = k + 0.18 * (i - 1.5)
+                ax.plot([low, high], [y, y], color=colour, linewidth=style.LINE)
+                ax.plot([value], [y], color=colour, marker=marker, markersize=5.0, linestyle="", label=arm if k == 0 else None)
+        ax.axvline(0.0, color=style.INK, linewidth=0.8)
+        ax.set_yticks(range(len(document["figures"])), [*document["figures"]])
+    left, right = figure.axes
+    left.invert_yaxis()
+    style.tidy(left, x_label=f"mean error minus that of {base} [cm] (less is better)")
+    style.tidy(right, x_label=f"return without the term minus that of {base} [1] (more is better)")
+    figure.legend(*left.get_legend_handles_labels(), loc="lower center", ncols=len(arms), fontsize=style.SMALL, frameon=False)
+    figure.tight_layout(rect=(0, 0.06, 1, 1))
+    return style.save(figure, path)
