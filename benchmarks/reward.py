@@ -4,17 +4,16 @@ It trains the matched arms that are missing in `out/reward`, drives all of them 
 with 95 % intervals (bootstrap over worlds and seeds). `--page docs/environments` writes the page `rewards.md`, its
 figure and `rewards.json`. The agents that all arms continue are trained before, as the page states.
 
-`--weights` prints the weight of each arm's term from tuning worlds, in which the start drives with the exploration that
-PPO begins with: the standard deviation of the term's discounted return is then that of the rest of the reward. The
-deviation is that between draws of exploration in the same world, because worlds that differ by themselves teach nothing.
+`--weights` prints for each arm the weight with which its term has the spread of the rest of the reward: the standard
+deviation of the discounted return between draws of exploration in the same world. The agent that all arms continue
+drives in tuning worlds, with the exploration that PPO begins with.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -23,7 +22,7 @@ import numpy as np
 
 from benchmarks.learning.study import Study, perform, place_of, read_study, unfinished
 from benchmarks.options import at_least, status_of
-from benchmarks.reward_page import FIGURES, Cell, draw, page, tables
+from benchmarks.reward_page import FIGURES, Cell, Document, draw, page, tables
 from coopenv.api.engine import Engine
 from coopenv.base.files import replace_text
 from coopenv.base.format import json_text
@@ -78,13 +77,16 @@ def spread(plan: TrainingPlan, weights: Mapping[str, float]) -> float:
     return float(np.sqrt(returns.reshape(TUNING_WORLDS, DRAWS, -1).var(axis=1, ddof=1).mean()))
 
 
-def balanced(plans: Sequence[TrainingPlan]) -> Iterator[tuple[str, str, float]]:
-    """Yield environment, key of the term and the weight with the spread of the rest of the reward, of each arm."""
-    for plan in plans:
+def balanced(study: Study) -> Iterator[tuple[str, str, float]]:
+    """Yield environment, arm, and the weight with which the arm's term has the spread of the rest of the reward."""
+    rest: dict[str, float] = {}
+    for plan, *_ in study.agents.values():
         if key := term_of(plan)[0]:
+            if plan.environment not in rest:
+                rest[plan.environment] = spread(plan, {key: 0.0})
             scenario = load_scenario(plan.environment, plan.all_overrides)
             alone = {**dict.fromkeys((PREFIX + name for name in scenario.reward.by_name), 0.0), key: 1.0}
-            yield plan.environment, key, spread(plan, {key: 0.0}) / spread(plan, alone)
+            yield plan.environment, str(plan.arm), rest[plan.environment] / spread(plan, alone)
 
 
 def figures_of(found: Episodes) -> dict[str, Statistic]:
@@ -98,7 +100,7 @@ def measured(study: Study, worlds: int, block: int) -> dict[str, dict[str, Runs]
     for plan in study.plans:
         key, _ = term_of(plan)
         rows = found.setdefault(plan.environment, {})
-        agents = {str(plan.arm): FOLDER / place_of(plan)}
+        agents: dict[str, str | Path] = {str(plan.arm): FOLDER / place_of(plan)}
         agents |= {} if rows else {REFERENCE: REFERENCE, START: str(plan.settings.start)}
         for name, agent in sorted(agents.items(), key=lambda item: item[0] == plan.arm):
             for figure, value in figures_of(driven(plan, agent, seeds, {key: 0.0} if key else {})).items():
@@ -151,33 +153,42 @@ def compared(
     }
 
 
+def document_of(
+    study: Study, found: Mapping[str, Mapping[str, Runs]], worlds: int, equal: Iterable[tuple[str, str, float]]
+) -> Document:
+    """Return the contents of `rewards.json` from the figures of all runs, and the weights of `balanced`."""
+    first = [plans[0] for plans in study.agents.values()]
+    weights = {(plan.environment, str(plan.arm)): term_of(plan)[1] for plan in first}
+    terms = {str(plan.arm): term_of(plan)[0].removeprefix(PREFIX) for plan in first}
+    return {
+        "worlds": worlds,
+        "block": BLOCK,
+        "steps": first[0].settings.steps,
+        "seeds": len(study.plans) // len(first),
+        "terms": terms,
+        "weights": {place: {arm: weights[place, arm] for arm in terms} for place in found},
+        "spreads": {
+            place: {arm: weights[place, arm] / value for at, arm, value in equal if at == place} for place in found
+        },
+        "figures": compared(found, worlds, [*terms][:2]),
+    }
+
+
 def answer(asked: argparse.Namespace) -> None:
     """Train what is missing, drive, and print the tables; or print the weights."""
     study = read_study(data_directory("agents") / "reward_study.toml")
-    first = [plans[0] for plans in study.agents.values()]
     if asked.weights:
-        for row in balanced(first):
+        for row in balanced(study):
             print("{} {} {:.2g}".format(*row), flush=True)
         return
     with needing(f"training needs the extra train: {install_command('train')}"):
         missing = unfinished(study, FOLDER)
     Local(asked.jobs).map(partial(perform, FOLDER, LOGS), missing, lambda n: print(f"{n}/{len(missing)} trained"))
-    arms = list(dict.fromkeys(str(plan.arm) for plan in first))
-    found = measured(study, asked.worlds, BLOCK)
-    settings = first[0].settings
-    document = {
-        "worlds": asked.worlds,
-        "block": BLOCK,
-        "steps": settings.steps,
-        "seeds": len(study.plans) // len(first),
-        "terms": {str(plan.arm): term_of(plan)[0].removeprefix(PREFIX) for plan in first},
-        "weights": {place: {str(p.arm): term_of(p)[1] for p in first if p.environment == place} for place in found},
-        "figures": compared(found, asked.worlds, arms[:2]),
-    }
+    document = document_of(study, measured(study, asked.worlds, BLOCK), asked.worlds, [*balanced(study)])
     print(tables(document))
     if asked.page:
         replace_text(asked.page / "rewards.json", json_text(document))
-        replace_text(asked.page / "rewards.md", page(json.loads(json_text(document))))
+        replace_text(asked.page / "rewards.md", page(document))
         draw(document, asked.page / "rewards.png")
 
 

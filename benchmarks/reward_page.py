@@ -37,8 +37,9 @@ the same worlds, with the same network and a discount by the horizon, and its la
 reward (progress, arrival, time, losses) is that of the environment. A collision or a lost route costs arrivals in
 `plain`, too.
 
-A term's weight follows from one rule: the standard deviation of its discounted return equals that of the rest of the
-reward. The deviation is that between draws of exploration of `start` in the same world (tuning worlds).
+One rule sets all weights: in an environment, every term has the same spread of the discounted return, near that of the
+rest of the reward; the brackets have the ratio of both. The spread is the standard deviation between draws of
+exploration of `start` in the same world, in tuning worlds.
 `truth` has the same form as `covariance`, with the true error in the place of the standard deviation: their difference
 is due to the covariance as a measure of the error.
 
@@ -63,8 +64,8 @@ The same figures minus those of `{base}` in the same worlds. The last column is 
 
 ## Limits
 
-- A percentile interval of {seeds} seeds is about a tenth too narrow. {tests} differences of the mean error are tested, so
-  an interval that hardly excludes 0 is weak evidence.
+- Percentile intervals of {seeds} seeds are about a tenth too narrow. {tests} differences of the mean error are
+  tested, so an interval that hardly excludes 0 is weak evidence.
 - One size of the weights, one start, one discount and {steps:,} decisions: learning has not converged, and a term that
   learns faster looks better than a term that learns more.
 - For speed, cameras have 10 Hz, odometry 20 Hz and decisions 5 Hz in all arms.
@@ -73,7 +74,7 @@ The same figures minus those of `{base}` in the same worlds. The last column is 
 for ENV in {places}; do
   coopenv train $ENV --settings agents/reward_start.toml --seed 1 --out out/reward/start/$ENV
 done
-python -m benchmarks.reward --weights                    # the weights in agents/reward_train.toml
+python -m benchmarks.reward --weights                    # weights with the ratio 1
 python -m benchmarks.reward --page docs/environments     # trains what is missing, and writes this page
 ```
 """
@@ -83,7 +84,7 @@ def page(document: Document) -> str:
     """Return the page in Markdown."""
     places, terms = list(document["weights"]), document["terms"]
     rows = [
-        [f"`{arm}`", f"`{term}`" if term else "none", *(f"{document['weights'][p][arm]:g}" if term else "" for p in places)]
+        [f"`{arm}`", f"`{term}`" if term else "none", *(_weight(document, place, arm) for place in places)]
         for arm, term in terms.items()
     ]
     values, differences = tables(document).split("\n\n")
@@ -92,7 +93,7 @@ def page(document: Document) -> str:
         **{name: document[name] for name in ("seeds", "steps", "worlds", "block")},
         count=len(places),
         places=" ".join(places),
-        arms=markdown(["arm", "term", *(f"weight in `{place}`" for place in places)], rows),
+        arms=markdown(["arm", "term", *(f"`{place}`" for place in places)], rows),
         verdict="\n".join(f"- {sentence}" for sentence in verdict(document)),
         values=values,
         differences=differences,
@@ -100,6 +101,12 @@ def page(document: Document) -> str:
         second=second,
         tests=len(terms) * len(places) - len(places),
     )
+
+
+def _weight(document: Document, place: str, arm: str) -> str:
+    """Return the weight of an arm's term, and its spread by that of the rest of the reward."""
+    ratio = document["spreads"][place].get(arm)
+    return f"{document['weights'][place][arm]:g} ({ratio:.2f})" if ratio else ""
 
 
 def tables(document: Document) -> str:
@@ -120,7 +127,7 @@ def tables(document: Document) -> str:
 def text(name: str, cell: Cell) -> str:
     """Return a figure or difference with its interval."""
     _, factor, digits = FIGURES[name]
-    value, low, high = (f"{factor * each:.{digits}f}".replace("-0.0", "0.0") for each in cell)
+    value, low, high = (f"{round(factor * each, digits) + 0.0:.{digits}f}" for each in cell)
     return f"{value} [{low}, {high}]"
 
 
@@ -150,13 +157,23 @@ def draw(document: Document, path: Path) -> Path:
                 value, low, high = (factor * each for each in rows[arm][name][base])
                 y = k + 0.18 * (i - 1.5)
                 ax.plot([low, high], [y, y], color=colour, linewidth=style.LINE)
-                ax.plot([value], [y], color=colour, marker=marker, markersize=5.0, linestyle="", label=arm if k == 0 else None)
+                ax.plot(
+                    [value],
+                    [y],
+                    color=colour,
+                    marker=marker,
+                    markersize=5.0,
+                    linestyle="",
+                    label=arm if k == 0 else None,
+                )
         ax.axvline(0.0, color=style.INK, linewidth=0.8)
         ax.set_yticks(range(len(document["figures"])), [*document["figures"]])
     left, right = figure.axes
     left.invert_yaxis()
     style.tidy(left, x_label=f"mean error minus that of {base} [cm] (less is better)")
     style.tidy(right, x_label=f"return without the term minus that of {base} [1] (more is better)")
-    figure.legend(*left.get_legend_handles_labels(), loc="lower center", ncols=len(arms), fontsize=style.SMALL, frameon=False)
+    figure.legend(
+        *left.get_legend_handles_labels(), loc="lower center", ncols=len(arms), fontsize=style.SMALL, frameon=False
+    )
     figure.tight_layout(rect=(0, 0.06, 1, 1))
     return style.save(figure, path)

@@ -44,8 +44,6 @@ NAMES = (*EXPORTED, CHECKPOINT_FILE, *CARD_FILES)
 LOGS = "tensorboard"
 WHILE_LEARNING = 2**30
 """Number of the first seed for evaluation that is looked at while learning; `coopenv evaluate` begins with number 0."""
-
-
 KEPT_FOR = 60.0  # s of learning after which at the latest there is a checkpoint
 FORMAT = 4
 HEADER = "coopenv_checkpoint"

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from benchmarks import reward, reward_page
-from benchmarks.learning.study import read_study
+from benchmarks.learning.study import Study, read_study
 from coopenv.base.installation import data_directory
 from coopenv.evaluation.metrics import Ratio
 from coopenv.scenario import load_scenario
+from coopenv.training.settings import TrainingPlan
 
 WORLDS = 6
 DOCS = Path(__file__).parents[2] / "docs" / "environments"
@@ -42,7 +43,9 @@ def test_the_mean_over_environments_is_that_of_their_differences() -> None:
     figures = reward.compared(found, WORLDS, ["plain"])
     value, low, high = figures[reward.MEAN]["truth"]["mean_m"]["plain"]
     assert value == pytest.approx(0.5) and low < 0.5 < high
-    assert high - low < 0.8 * (figures["a"]["truth"]["mean_m"]["plain"][2] - figures["a"]["truth"]["mean_m"]["plain"][1])
+    assert high - low < 0.8 * (
+        figures["a"]["truth"]["mean_m"]["plain"][2] - figures["a"]["truth"]["mean_m"]["plain"][1]
+    )
 
 
 def test_a_weight_gives_the_term_the_spread_of_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,9 +56,10 @@ def test_a_weight_gives_the_term_the_spread_of_the_rest(monkeypatch: pytest.Monk
     settings = plan.settings.model_copy(
         update={"start": "route_follower", "scenario": {**plan.settings.scenario, "horizon": 4.0}}
     )
-    plan = reward.TrainingPlan(plan.environment, settings, 1, "truth")
-    ((place, key, weight),) = reward.balanced([plan])
-    assert (place, key) == (plan.environment, "reward.weights.position_error_per_metre")
+    plan = TrainingPlan(plan.environment, settings, 1, "truth")
+    ((place, arm, weight),) = reward.balanced(Study((plan,)))
+    key, own = reward.term_of(plan)
+    assert (place, arm, key) == (plan.environment, "truth", "reward.weights.position_error_per_metre") and own > 0.0
     names = load_scenario(place).reward.by_name
     alone = {**{f"reward.weights.{name}": 0.0 for name in names}, key: weight}
     assert reward.spread(plan, alone) == pytest.approx(reward.spread(plan, {key: 0.0}), rel=1e-4)
@@ -80,6 +84,7 @@ def document() -> dict[str, object]:
     return {
         "worlds": WORLDS, "block": 7, "steps": 1000, "seeds": 3, "terms": {"plain": "", "covariance": "uncertainty"},
         "weights": {place: {"plain": 0.0, "covariance": 2.0} for place in ("a", "b")},
+        "spreads": {"a": {"covariance": 1.1}, "b": {"covariance": 0.9}},
         "figures": reward.compared(found, WORLDS, ["plain", "covariance"]),
     }  # fmt: skip
 
@@ -94,6 +99,7 @@ def test_the_verdict_is_that_of_the_intervals(tmp_path: Path) -> None:
     found = next(iter(reward_page.verdict(made)))
     assert "rises in `b` (20.0 [10.0, 30.0] cm)" in found
     assert "does not change clearly in `a` (10.0 [-10.0, 30.0] cm)" in found
+    assert "| `covariance` | `uncertainty` | 2 (1.10) | 2 (0.90) |" in reward_page.page(made)
     assert reward_page.draw(made, tmp_path / "rewards.png").stat().st_size > 5000
 
 
