@@ -91,14 +91,16 @@ def document() -> dict[str, object]:
 
 def test_the_verdict_is_that_of_the_intervals(tmp_path: Path) -> None:
     made = document()
-    found, rest, *_ = reward_page.verdict(made)
-    assert found.startswith("`covariance`: the mean error falls in `a` (-100.0 [-") and "rises" not in found
-    assert rest.startswith("`covariance`: the return without the term falls in `a` (-1.0 [-")
-    made["figures"]["a"]["covariance"]["mean_m"]["plain"] = (0.1, -0.1, 0.3)  # type: ignore[index]
-    made["figures"]["b"]["covariance"]["mean_m"]["plain"] = (0.2, 0.1, 0.3)  # type: ignore[index]
-    found = next(iter(reward_page.verdict(made)))
-    assert "rises in `b` (20.0 [10.0, 30.0] cm)" in found
-    assert "does not change clearly in `a` (10.0 [-10.0, 30.0] cm)" in found
+    *first, last = reward_page.verdict(made)
+    assert first[0].startswith("The mean of all: against `plain`, the mean error falls with `covariance` (-100.0 [-")
+    assert last.startswith("`b`: against `plain`, the mean error falls with `covariance` (-100.0 [-")
+    for cell, words in (
+        ((0.1, -0.1, 0.3), "has no clear change with `covariance` (10.0 [-10.0, 30.0] cm)"),
+        ((0.2, 0.1, 0.3), "rises with `covariance` (20.0 [10.0, 30.0] cm)"),
+    ):
+        made["figures"]["b"]["covariance"]["mean_m"]["plain"] = cell  # type: ignore[index]
+        *_, last = reward_page.verdict(made)
+        assert last == f"`b`: against `plain`, the mean error {words}."
     assert "| `covariance` | `uncertainty` | 2 (1.10) | 2 (0.90) |" in reward_page.page(made)
     assert reward_page.draw(made, tmp_path / "rewards.png").stat().st_size > 5000
 
