@@ -70,8 +70,8 @@ The same figures minus those of `{base}` in the same worlds. The last column is 
 
 - The bootstrap of {seeds} seeds makes their part of an interval {narrow:.0f} % too narrow. {tests} differences of the
   mean error are tested, so an interval that hardly excludes 0 is weak evidence.
-- One size of the weights, one start, one discount and {steps:,} decisions: learning has not converged (compare `peek`), and
-  a term that teaches faster looks better than a term that teaches more. With a smaller weight, a term that costs
+- One size of the weights, one start, one discount and {steps:,} decisions: learning has not converged (compare `peek`),
+  and a term that teaches faster looks better than a term that teaches more. With a smaller weight, a term that costs
   arrivals may pay.
 - `information` rewards standing near good landmarks until the horizon.
 - For speed, cameras have 10 Hz, odometry 20 Hz and decisions 5 Hz in all arms.
