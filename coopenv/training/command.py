@@ -45,8 +45,6 @@ NAMES = (*EXPORTED, CHECKPOINT_FILE, *CARD_FILES)
 LOGS = "tensorboard"
 WHILE_LEARNING = 2**30
 """Number of the first seed for evaluation that is looked at while learning; `coopenv evaluate` begins with number 0."""
-
-
 KEPT_FOR = 60.0  # s of learning after which at the latest there is a checkpoint
 FORMAT = 4
 HEADER = "coopenv_checkpoint"
@@ -232,7 +230,7 @@ def _notes(trainer: Trainer, course: Course) -> Iterator[str]:
     if status.share < 1.0:
         spent = f"{status.steps:,} of {settings.steps:,} steps"
         yield f"Stopped by --minutes {settings.minutes:g} after {spent}: another load gives another agent"
-    if course.curve and (steps := course.best_row["steps"]) < status.steps:
+    if course.curve and settings.evaluation.keep == "best" and (steps := course.best_row["steps"]) < status.steps:
         yield f"Kept: the policy after {steps:,} steps, the best in the worlds for validation"
 
 
@@ -263,7 +261,7 @@ def _learn(trainer: Trainer, course: Course, report: Reports, judge: Judge, keep
         means = figures_of(judge(trainer.mean_action, f"{status.steps:,} steps", seeds))
         trainer.record(means)
         course.curve.append({"steps": status.steps, "seconds": round(status.seconds, 1), **means})
-        if course.best_row is course.curve[-1]:
+        if evaluation.keep == "last" or course.best_row is course.curve[-1]:
             course.best = trainer.tensors()
 
     if trainer.status.steps == 0:

@@ -129,6 +129,8 @@ class EvaluationSettings(Section):
     """Held-out worlds of an evaluation during training, one episode each."""
     final_worlds: Several = 256
     """Held-out worlds of the last evaluation, for the results in `agent.toml`."""
+    keep: Literal["best", "last"] = "best"
+    """Policy of the agent: the best in the worlds of these evaluations, which the true errors rank, or the last."""
     drivers: tuple[str, ...] = ("peek", "look_ahead")
     """Drivers that the result is ranked among, beside the cloned driver and the clone; those that can drive here."""
 

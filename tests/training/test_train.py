@@ -435,6 +435,8 @@ def test_a_clone_that_learning_makes_worse_is_kept(here: Path, monkeypatch: pyte
     own, begun = (ranking.drivers[name]["e95_m"] for name in ("agent", "clone"))
     assert own == pytest.approx(begun, rel=1e-4)
     assert ranking.notes == ("Kept: the policy after 0 steps, the best in the worlds for validation",)
+    last, ranking = trained(here, CLONED.replace("every = ", 'keep = "last"\nevery = '))
+    assert not np.array_equal(last["layers.0.weight"], clone["layers.0.weight"]) and ranking.notes == ()
 
 
 def test_minutes_stop_a_training_with_a_note(here: Path) -> None:

@@ -72,8 +72,10 @@ def test_the_shipped_studies_compare_like_with_like() -> None:
     agents = data_directory("agents")
     assert {plan.arm for plan in read_study(agents / "study.toml").plans} == {"quality"}
     reward = read_study(agents / "reward_study.toml")
-    first, *others = [plans[0].settings.model_dump() for plans in reward.agents.values()]
-    assert [each | {"scenario": {}} for each in others] == [first | {"scenario": {}}] * len(others) and others
+    for place in {plan.environment for plan in reward.plans}:
+        arms = [plans[0].settings.model_dump() for plans in reward.agents.values() if plans[0].environment == place]
+        first, *others = arms
+        assert [each | {"scenario": {}} for each in others] == [first | {"scenario": {}}] * len(others) and others
 
 
 def test_parts(study: Study) -> None:
