@@ -98,8 +98,9 @@ def report(environment: str, worlds: int, block: int, others: Sequence[str]) -> 
         [
             "## What learning is worth",
             f"`{environment}_rule` is a hand-written rule whose constants a random search has tuned; it reads what "
-            f"`{environment}_team` reads, a vehicle's own observation. `team_look_ahead` reads all covariances. Mean "
-            "of the position error from 3 s on, at most 1 m, which is that of a lost vehicle, and the difference in "
+            f"`{environment}_team` reads, a vehicle's own observation. The team has no memory. `team_look_ahead` "
+            "reads all covariances. Mean of the position error from 3 s on, at most 1 m, which is that of a lost "
+            "vehicle, and the difference in "
             f"the same worlds, over {worlds} held-out worlds of block {block}, with standard errors. In the last rows, "
             "fields of the observation read 0, for which the team was not trained: they show what it reads, not what "
             "a team that is trained without these fields can do.",
