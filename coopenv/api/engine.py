@@ -118,8 +118,7 @@ class Engine:
         if self.backend.capabilities.real_time:
             self.load()  # before anybody waits for a command
         if not self.begun:
-            if self.world.device == "cpu":
-                compile_side_by_side([*self.world.large_modules, results_kernel(self.world.precision)])
+            self._compile()
             mask = None
             drawn = world_keys(training_seed(), self.world.worlds)
             seeds = drawn if seeds is None else [b if a is None else a for a, b in zip(seeds, drawn, strict=True)]
@@ -145,8 +144,13 @@ class Engine:
         if not self.begun:
             raise CoopenvError(f"{call}() called before reset()")
 
+    def _compile(self) -> None:
+        if self.world.device == "cpu":
+            compile_side_by_side([*self.world.large_modules, results_kernel(self.world.precision)])
+
     def load(self) -> None:
         """Load all kernels, compiling the missing ones; nothing moves."""
+        self._compile()
         (self.plugins or self.world).load()
         self._own_terms.end_episodes()
         self._fill("load", self._nowhere, self._nowhere)

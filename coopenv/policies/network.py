@@ -118,7 +118,7 @@ class Network:
         self._places = {name: slice(observation[name].start, observation[name].stop) for name in self._seen}
         self._outside = dict.fromkeys(self._seen, 0.0)
         self._rules: list[RightOfWay | Alone] = [RightOfWay(scenario)] if network.right_of_way else []
-        self._rules += [Alone(scenario, network.alone)] if network.alone else []
+        self._rules += [Alone(scenario, network.alone)] if network.alone is not None else []
         self.agents = next((rule.agents for rule in self._rules if rule.agents), [])
         """Names of the vehicles in the order of rows, where a rule needs the rows of all."""
 

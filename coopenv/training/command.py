@@ -114,7 +114,7 @@ def possible(plan: TrainingPlan) -> Scenario:
         if settings.right_of_way:
             RightOfWay(scenario)
         rule = "alone"
-        if settings.alone:
+        if settings.alone is not None:
             Alone(scenario, settings.alone)
     except (CoopenvError, ValueError) as error:
         raise CoopenvError(f"{rule}: {error}") from None
@@ -205,7 +205,7 @@ def train(
             _learn(trainer, course, report, judge, partial(save, path, trainer, course, onnx, logs))
             if course.best:
                 trainer.take(course.best)
-            results = judge(trainer.mean_action, out.name, seeds)
+            results = judge(_finished(trainer), out.name, seeds)
         except DivergedError as error:
             if not path.is_file():
                 raise
@@ -215,6 +215,14 @@ def train(
             export(folder, out, trainer, environment, results, course.curve, onnx)
         report.ranked(_ranking(out, course, results, _notes(trainer, course)))
     return results
+
+
+def _finished(trainer: Trainer) -> Policy:
+    """Return the driver that the agent is: the policy, and in its place the driver of those who are alone."""
+    if trainer.plan.settings.alone is None:
+        return trainer.mean_action
+    alone = Alone(trainer.scenario, trainer.plan.settings.alone)
+    return lambda observations: alone(observations, trainer.mean_action(observations))
 
 
 def _ranking(out: Path, course: Course, results: list[Result], notes: Iterable[str]) -> Ranking:

@@ -148,7 +148,7 @@ class Settings(Section):
     """Limit the speeds to those at which the driver `look_ahead` gives way, and follow its plans where a vehicle stands
     in the way or the route is too far away."""
     alone: str | None = None
-    """Agent that drives in place of the finished policy where a vehicle receives no message in its first second."""
+    """Agent of coopenv's that drives in place of the policy where a vehicle receives no message in its first second."""
     scenario: dict[str, Any] = Field(default={})
     """Overrides of the scenario, as tables or dotted keys, as with `--override`."""
     randomised: dict[str, Any] = Field(default={})
@@ -169,6 +169,8 @@ class Settings(Section):
             raise ValueError("steps: 0 is for a clone alone, nothing is learnt without [clone]")
         if self.start is not None and self.clone is not None:
             raise ValueError("start: a training begins as an agent or as a [clone], give one of them")
+        if self.network and self.alone is not None:
+            raise ValueError(f"alone: not with network = '{self.network}'")
         if sum(variation.share for variation in self.variations) > 1.0:
             raise ValueError("variations: their shares add up to more than 1")
         if not self.network and self.clone is not None and self.clone.elsewhere is not None:

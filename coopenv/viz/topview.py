@@ -27,22 +27,15 @@ class PictureWindow:
         self._title, self._silent = title, False
         self._image: Any = None
 
-    @property
-    def is_open(self) -> bool:
-        """True if the window exists and the user has not closed it."""
-        if self._image is None:
-            return False
-        from matplotlib import pyplot as plt
-
-        return bool(plt.fignum_exists(self._image.figure.number))
-
     def show(self, picture: np.ndarray) -> None:
         """Show an (H, W, 3) uint8 picture and let the window react to the user, who may close it for good."""
         if self._image is None and not self._silent:
             self._image = _opened(self._title, picture)
+        from matplotlib import pyplot as plt
+
         if self._image is None:
             self._silent = True
-        elif self.is_open:
+        elif plt.fignum_exists(self._image.figure.number):
             self._image.set_data(picture)
             self._image.figure.canvas.draw_idle()
             self._image.figure.canvas.flush_events()

@@ -42,8 +42,8 @@ PROBE_BYTES = 5 << 20  # as much as the source and the code of a large module ha
 LONGEST_COMPILATION = 120.0  # s; a process that holds a lock for longer is taken for suspended (Ctrl-Z)
 SHIPPED = Path(__file__).resolve().parents[1] / "data" / "kernels"  # no other folder: it has machine code
 """Compiled modules of the wheel; of a checkout those of `python -m benchmarks.kernels`."""
-_MODULE, _LOCKS, _HEADERS = "wp_", "locks", "coopenv.headers"
-"""Prefix of the folders of modules; folder of the locks; module with which Warp's headers are compiled."""
+_MODULE, _LOCKS = "wp_", "locks"
+"""Prefix of the folders of modules; folder of the locks."""
 _loaded: set[str] = set()  # names of modules that this process has loaded
 
 
@@ -84,15 +84,14 @@ def compile_side_by_side(kernels: Sequence[wp.Kernel]) -> None:
     """
     found, caches = {kernel.module.name: kernel for kernel in kernels}, (SHIPPED, cache_folder())
     missing = [found[name] for name in found if not any([*cache.glob(_folders(name))] for cache in caches)]
-    cores = min(len(missing), available_cores())
+    cores, headers = min(len(missing), available_cores()), f"coopenv.headers.{os.getpid()}"
     if cores < 2:
         return
     probe()
-    with _locked(_HEADERS):
-        for left in cache_folder().glob(_folders(_HEADERS)):
-            shutil.rmtree(left, ignore_errors=True)
-        with headers_precompiled(_HEADERS, _own_options()) as share, ThreadPoolExecutor(cores, "", share) as pool:
-            list(pool.map(_compile, missing))
+    with headers_precompiled(headers, _own_options()) as share, ThreadPoolExecutor(cores, "", share) as pool:
+        list(pool.map(_compile, missing))
+    for left in cache_folder().glob(_folders(headers)):
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def _compile(kernel: wp.Kernel) -> None:

@@ -44,18 +44,19 @@ def cpu_features() -> frozenset[str]:
 def headers_precompiled(name: str, options: Mapping[str, Any]) -> Iterator[Callable[[], None]]:
     """Compile Warp's headers for modules with these options; yields what lets a thread use them, instead of its own.
 
-    They are compiled with a module of this name, which must not be in the cache.
+    They are compiled with a module of this name, which must not be in the cache; else every thread compiles its own.
     """
     module = context.Module(name, None)
     module.options.update(options, enable_backward=False)
     wp.Kernel(func=_nothing, key="nothing", module=module).module.load(context.get_device("cpu"), 1)
     runtime: Any = context.runtime
     folders, threads = runtime._pch_dirs, list[int]()
-    compiled = folders[threading.get_ident()]
+    compiled = folders.get(threading.get_ident())  # None: the user wants none
 
     def share() -> None:
-        threads.append(threading.get_ident())
-        folders[threads[-1]] = compiled
+        if compiled is not None:
+            threads.append(threading.get_ident())
+            folders[threads[-1]] = compiled
 
     try:
         yield share

@@ -291,12 +291,18 @@ def test_an_environment_that_changed_since(here: Path, capsys: pytest.CaptureFix
         ),
         (["train", "facade", "--settings", "alone.toml"], "alone: the observation lacks message_mask"),
         (["train", "urban_crossing", "--settings", "wrong.toml"], "alone: unknown agent 'nobody'"),
+        (["train", "urban_crossing", "--settings", "own.toml"], "alone: unknown agent 'mine.py:Mine'"),
     ],
 )
 def test_mistakes_are_one_line(
     arguments: list[str], message: str, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name, line in (("rule", "right_of_way = true"), ("alone", "alone = 'peek'"), ("wrong", "alone = 'nobody'")):
+    for name, line in (
+        ("rule", "right_of_way = true"),
+        ("alone", "alone = 'peek'"),
+        ("wrong", "alone = 'nobody'"),
+        ("own", "alone = 'mine.py:Mine'"),
+    ):
         (here / f"{name}.toml").write_text(line)
     assert main(arguments) == 2
     error_text = capsys.readouterr().err
