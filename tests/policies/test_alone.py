@@ -37,3 +37,27 @@ def test_without_messages_in_the_observation_there_is_no_alone() -> None:
     scenario = coopenv.load_scenario(ENV, {"observation.exclude": ["messages"]})
     with pytest.raises(ValueError, match="lacks message_mask"):
         Alone(scenario, "route_follower")
+
+
+def test_the_other_agent_begins_where_a_vehicle_becomes_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it remembers of a vehicle does not depend on when others became alone; it drives all vehicles by name."""
+    scenario, begun = coopenv.load_scenario(ENV), list[list[bool]]()
+
+    class Other:
+        def reset(self, mask: np.ndarray) -> None:
+            begun.append(mask.tolist())
+
+        def __call__(self, observations: np.ndarray) -> np.ndarray:
+            return np.ones((len(observations), 2))
+
+    monkeypatch.setattr("coopenv.policies.alone.load_agent", lambda name, scenario: Other())
+    alone = Alone(scenario, "peek")
+    assert alone.agents == list(scenario.vehicle_names)
+    seen = np.zeros((2, observation_layout(scenario).size), dtype=np.float32)
+    patience = round(PATIENCE * scenario.rates.decision)
+    for decision in range(1, 2 * patience):
+        if decision == 4:
+            alone.reset(np.array([False, True]))
+        drives = alone(seen, np.zeros((2, 2)))[:, 0]
+        assert drives.tolist() == [decision > patience, decision > patience + 3]
+    assert begun == [[True, True], [False, True], [True, False], [False, True]]

@@ -24,7 +24,7 @@ from coopenv.policies.network import Network, RightOfWay
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import REWARD_TERMS
 from coopenv.training.batches import LEAST_VARIANCE, NormalisedEnv
-from coopenv.training.command import train
+from coopenv.training.command import _finished, train
 from coopenv.training.export import export, onnx_model
 from coopenv.training.settings import Clone, EvaluationSettings, Ppo, Settings, TrainingPlan, environment_file
 from coopenv.training.trainer import Trainer, Watch, watch
@@ -263,3 +263,18 @@ def test_an_agent_of_a_longer_action_is_not_this_one(trained: Trainer, tmp_path:
     (tmp_path / "agent.toml").write_text(text)
     with pytest.raises(coopenv.CoopenvError, match="another action: 'pan' is not in this environment"):
         load_agent(tmp_path, trained.scenario)
+
+
+def test_the_judged_driver_is_the_one_that_the_agent_is() -> None:
+    """Where a vehicle receives no message, it is that of the key `alone`."""
+    scenario = coopenv.load_scenario("lighthouse")
+
+    def mean_action(observations: np.ndarray) -> np.ndarray:
+        return np.full((len(observations), 2), -1.0)
+
+    for alone, drives in ((None, False), ("constant_speed", True)):
+        plan = SimpleNamespace(settings=SimpleNamespace(alone=alone))
+        driver = _finished(SimpleNamespace(plan=plan, scenario=scenario, mean_action=mean_action))
+        seen = np.zeros((2, observation_layout(scenario).size), dtype=np.float32)
+        actions = [driver(seen) for _ in range(round(scenario.rates.decision) + 1)]
+        assert (actions[0] == -1.0).all() and (actions[-1] != -1.0).any() == drives

@@ -297,6 +297,7 @@ def test_missing_modules_are_compiled_side_by_side(tmp_path: Path, monkeypatch: 
     kernels = [wp.overload(launch.kernel(function, "float32.side"), types) for function in (double, halve)]
     launch.compile_side_by_side(kernels)
     assert len(compiled) == 3 and len(set(compiled)) == 1
+    assert not [*tmp_path.glob("wp_*headers*")]
     x = wp.array(np.arange(3.0), dtype=wp.float32, device="cpu")
     for kernel in kernels:
         launch.launch(kernel, dim=3, inputs=[x], device="cpu", block_dim=1)
@@ -337,3 +338,6 @@ def test_large_modules_are_those_that_launches_need(observer: str, monkeypatch: 
     envs.step(envs.action_space.sample())
     assert {kernel.module.name for kernel in before} == launch._loaded
     assert before == {kernel: kernel.module.get_module_hash(1) for kernel in before}
+    before.clear()
+    coopenv.make_vec("busy_intersection", num_worlds=2, observer=observer).engine.load()
+    assert before, "commands load kernels before any reset"
