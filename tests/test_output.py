@@ -116,7 +116,7 @@ def test_a_mistake_is_one_line_and_nothing_is_left(
 
 
 @pytest.mark.skipif(not os.path.ismount("/proc"), reason="needs a folder that nobody can write to")
-@pytest.mark.parametrize("arguments", [[*EVALUATE, "peek"], [*FILM, "peek"]])
+@pytest.mark.parametrize("arguments", [[*EVALUATE, "peek"], ["run", "facade", *SHORT]])
 def test_a_folder_that_cannot_be_made(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*arguments, "--out", "/proc/nobody"]) == 2
     assert "error: cannot write to /proc/nobody" in capsys.readouterr().err

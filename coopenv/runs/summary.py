@@ -98,7 +98,7 @@ def _gain(value: float | tuple[float, ...] | dict[str, float]) -> str:
 def _own(scenario: Scenario, part: str) -> str:
     """Return the vehicles that have a camera, noise or limits of their own."""
     names = [name for name, v in zip(scenario.vehicle_names, scenario.vehicles, strict=True) if getattr(v, part)]
-    return f"; {listed(names)} with entries of their own" if names else ""
+    return f"; other for {listed(names)}" if names else ""
 
 
 def _vehicles(scenario: Scenario) -> str:
