@@ -18,7 +18,7 @@ from coopenv.api.arguments import RewardFunction, Step, check_function, reward_o
 from coopenv.api.host_observers import PlugIns
 from coopenv.api.terms.layout import observation_layout
 from coopenv.api.terms.own import OwnTerms
-from coopenv.api.terms.results import MEMORY, results_kernel, results_struct, results_table, team_results
+from coopenv.api.terms.results import MEMORY, results_struct, results_table, step_results, team_results
 from coopenv.base.errors import CoopenvError, check_memory, error_text
 from coopenv.base.installation import load_reference
 from coopenv.base.seeds import training_seed, world_keys
@@ -28,7 +28,7 @@ from coopenv.sources.base import Backend
 from coopenv.sources.sources import simulation_of
 from coopenv.sources.tick_world import open_world
 from coopenv.world.embedded import HOST
-from coopenv.world.launch import PerWorld, compile_side_by_side
+from coopenv.world.launch import PerWorld
 from coopenv.world.model import device_memory
 from coopenv.world.state import allocate, has_begun, overwrite, size_of
 from coopenv.world.world import Keys
@@ -118,7 +118,6 @@ class Engine:
         if self.backend.capabilities.real_time:
             self.load()  # before anybody waits for a command
         if not self.begun:
-            self._compile()
             mask = None
             drawn = world_keys(training_seed(), self.world.worlds)
             seeds = drawn if seeds is None else [b if a is None else a for a, b in zip(seeds, drawn, strict=True)]
@@ -144,13 +143,8 @@ class Engine:
         if not self.begun:
             raise CoopenvError(f"{call}() called before reset()")
 
-    def _compile(self) -> None:
-        if self.world.device == "cpu":
-            compile_side_by_side([*self.world.large_modules, results_kernel(self.world.precision)])
-
     def load(self) -> None:
         """Load all kernels, compiling the missing ones; nothing moves."""
-        self._compile()
         (self.plugins or self.world).load()
         self._own_terms.end_episodes()
         self._fill("load", self._nowhere, self._nowhere)
@@ -214,7 +208,7 @@ class Engine:
         world = self.world
         parts = [PerWorld(part) for part in (self._own_terms.records, self.results, fresh, chosen)]
         arguments = [world.model, PerWorld(world.state), self._table, *parts]
-        world.launch.by_vehicle(key, results_kernel(world.precision), arguments, world.model.vehicles)
+        world.launch.by_vehicle(key, step_results, arguments, world.model.vehicles)
         self._own_terms.fill(key, fresh, chosen)
         if stepped and self._reward is not None:
             earning = self.view("alive") & (fresh.numpy()[:, None] == 0)

@@ -27,14 +27,7 @@ import warp as wp
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.files import lock, muted_errors
 from coopenv.base.installation import available_cores
-from coopenv.world.warp_internals import (
-    SOURCE_RULES,
-    cpu_features,
-    field_types,
-    headers_precompiled,
-    lanes_guest,
-    replay_of,
-)
+from coopenv.world.warp_internals import SOURCE_RULES, cpu_features, field_types, lanes_guest, replay_of
 
 ATTEMPTS = 3
 """Attempts to load a module: the second rebuilds it, the third is for two processes that rebuild the same one."""
@@ -77,35 +70,8 @@ def launch(kernel: wp.Kernel, **options: Any) -> Any:
     return done
 
 
-def compile_side_by_side(kernels: Sequence[wp.Kernel]) -> None:
-    """Compile for the CPU, one per core, the modules of kernels of which the caches have no version.
-
-    What fails here fails again in `launch`, which repairs or explains it.
-    """
-    found, caches = {kernel.module.name: kernel for kernel in kernels}, (SHIPPED, cache_folder())
-    missing = [found[name] for name in found if not any([*cache.glob(_folders(name))] for cache in caches)]
-    cores, headers = min(len(missing), available_cores()), f"coopenv.headers.{os.getpid()}"
-    if cores < 2:
-        return
-    probe()
-    with headers_precompiled(headers, _own_options()) as share, ThreadPoolExecutor(cores, "", share) as pool:
-        list(pool.map(_compile, missing))
-    for left in cache_folder().glob(_folders(headers)):
-        shutil.rmtree(left, ignore_errors=True)
-
-
-def _compile(kernel: wp.Kernel) -> None:
-    with _locked(kernel.module.name), suppress(Exception):
-        kernel.module.load(wp.get_device("cpu"), 1)
-
-
-def _folders(name: str) -> str:
-    """Return the pattern of the folders of all versions of a module."""
-    return f"{_MODULE}{escape(name)}_{'[0-9a-f]' * 7}"
-
-
 def _launch(kernel: wp.Kernel, options: dict[str, Any]) -> Any:
-    folders = _folders(kernel.module.name)
+    folders = f"{_MODULE}{escape(kernel.module.name)}_{'[0-9a-f]' * 7}"
     for module in SHIPPED.glob(folders):
         if not (cached := cache_folder() / module.name).exists():
             with suppress(OSError):  # it is compiled instead

@@ -6,7 +6,6 @@
 | `device_function`, `subroutine` | `Function.__class__`, `inline_hint`, `overload.adj` | records by reference |
 | `struct_of`, `field_types` | `StructInstance._cls`, `Struct.vars` | fields of a record |
 | `scalar_of` | `_wp_scalar_type_` | the NumPy type of an array of vectors |
-| `headers_precompiled` | `runtime._pch_dirs` | precompiled headers for several threads |
 | `cpu_features` | `context._get_cpu_feature_set` | the processor, as LLVM names it |
 | `_kernel_source` | `codegen.codegen_kernel`, `Adjoint.args` | no copies of records; no kernels of the host on CUDA |
 | `_function_source` | `codegen.codegen_func`, `codegen.cpu_module_header` | CPU: indices and loops as in C, calls |
@@ -18,9 +17,7 @@ gives them; all that their modules have more is the namespace `coopenv`, with on
 
 import ctypes
 import re
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
@@ -38,35 +35,6 @@ SOURCE_RULES = sha256(Path(__file__).read_bytes()).hexdigest()[:16]
 def cpu_features() -> frozenset[str]:
     """Return LLVM's names of the features of this processor; Warp must be initialised."""
     return frozenset(context._get_cpu_feature_set())
-
-
-@contextmanager
-def headers_precompiled(name: str, options: Mapping[str, Any]) -> Iterator[Callable[[], None]]:
-    """Compile Warp's headers for modules with these options; yields what lets a thread use them, instead of its own.
-
-    They are compiled with a module of this name, which must not be in the cache; else every thread compiles its own.
-    """
-    module = context.Module(name, None)
-    module.options.update(options, enable_backward=False)
-    wp.Kernel(func=_nothing, key="nothing", module=module).module.load(context.get_device("cpu"), 1)
-    runtime: Any = context.runtime
-    folders, threads = runtime._pch_dirs, list[int]()
-    compiled = folders.get(threading.get_ident())  # None: the user wants none
-
-    def share() -> None:
-        if compiled is not None:
-            threads.append(threading.get_ident())
-            folders[threads[-1]] = compiled
-
-    try:
-        yield share
-    finally:
-        for thread in threads:
-            del folders[thread]
-
-
-def _nothing() -> None:
-    pass
 
 
 def replay_of(command: Any) -> Callable[[], Any]:

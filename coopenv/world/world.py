@@ -236,12 +236,6 @@ class World:
             return fused_kernels(self.source, self.observer, self.precision, lanes)
         return source_kernels(self.source, self.precision)
 
-    @property
-    def large_modules(self) -> list[wp.Kernel]:
-        """A kernel of each module whose compilation takes seconds."""
-        embedded = [observer_kernels(self.observer, self.precision)["start"]] if self.observer.starts else []
-        return [self._world_kernels["begin"], *embedded]
-
     def restart(self) -> None:
         """Start the next episode in the worlds of `self.mask`, on the device."""
         self._run("begin", self._world_kernels["begin"], self._record, PerWorld(self.mask))

@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ import pytest
 import warp as wp
 
 import coopenv
-from coopenv.api import engine
 from coopenv.api.vector_env import INFO_FIELDS
 from coopenv.sources.worlds import Simulated
 from coopenv.world import launch, state
@@ -132,7 +130,6 @@ def test_no_other_file_uses_the_private_interface_of_warp() -> None:
 
 PROGRAM = """
 import sys
-import threading
 from typing import Any
 import numpy as np
 import warp as wp
@@ -273,71 +270,3 @@ def test_modules_of_a_wheel_are_copied_and_not_compiled(tmp_path: Path) -> None:
 
 def test_machine_code_is_taken_from_the_package_alone() -> None:
     assert Path(coopenv.__file__).parent / "data" / "kernels" == launch.SHIPPED
-
-
-def halve(x: wp.array(dtype=Any)):
-    i = wp.tid()
-    x[i] = x[i] / x.dtype(2.0)
-
-
-def test_missing_modules_are_compiled_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Warp's headers are compiled once for all; a launch finds the modules, and a second time nothing is compiled."""
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    monkeypatch.setattr(launch, "available_cores", lambda: 2)
-    compiled, both, build = list[Path](), threading.Barrier(2, timeout=60.0), wp._src.build.build_cpu
-
-    def counted(*arguments: Any, **options: Any) -> None:
-        compiled.append(Path(options["pch_dir"]))
-        if len(compiled) > 1:
-            both.wait()
-        build(*arguments, **options)
-
-    monkeypatch.setattr(wp._src.build, "build_cpu", counted)
-    types = [wp.array(dtype=wp.float32)]
-    kernels = [wp.overload(launch.kernel(function, "float32.side"), types) for function in (double, halve)]
-    launch.compile_side_by_side(kernels)
-    assert len(compiled) == 3 and len(set(compiled)) == 1
-    assert not [*tmp_path.glob("wp_*headers*")]
-    x = wp.array(np.arange(3.0), dtype=wp.float32, device="cpu")
-    for kernel in kernels:
-        launch.launch(kernel, dim=3, inputs=[x], device="cpu", block_dim=1)
-    assert x.numpy().tolist() == [0.0, 1.0, 2.0]
-    launch.compile_side_by_side(kernels)
-    assert len(compiled) == 3
-
-
-def test_a_broken_module_is_left_to_its_launch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    monkeypatch.setattr(launch, "available_cores", lambda: 2)
-
-    def broken(x: wp.array(dtype=wp.float32)):
-        x[0] = nowhere  # noqa: F821
-
-    kernels = [
-        launch.kernel(broken, "float32.side"),
-        wp.overload(launch.kernel(double, "float32.other"), [wp.array(dtype=wp.float32)]),
-    ]
-    launch.compile_side_by_side(kernels)
-    assert [*tmp_path.glob("wp_*double*")] and not [*tmp_path.glob("wp_*broken*")]
-    with pytest.raises(Exception, match="nowhere"):
-        launch.launch(kernels[0], dim=1, inputs=[wp.zeros(1, dtype=wp.float32, device="cpu")], device="cpu")
-
-
-@pytest.mark.parametrize("observer", ["riccati", "robust"])
-def test_large_modules_are_those_that_launches_need(observer: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their hashes are known before the first launch, which adds nothing to them."""
-    before = dict[wp.Kernel, bytes]()
-
-    def note(kernels: list[wp.Kernel]) -> None:
-        before.update({kernel: kernel.module.get_module_hash(1) for kernel in kernels})
-
-    monkeypatch.setattr(engine, "compile_side_by_side", note)
-    monkeypatch.setattr(launch, "_loaded", set())
-    envs = coopenv.make_vec("busy_intersection", num_worlds=2, observer=observer)
-    envs.reset(seed=0)
-    envs.step(envs.action_space.sample())
-    assert {kernel.module.name for kernel in before} == launch._loaded
-    assert before == {kernel: kernel.module.get_module_hash(1) for kernel in before}
-    before.clear()
-    coopenv.make_vec("busy_intersection", num_worlds=2, observer=observer).engine.load()
-    assert before, "commands load kernels before any reset"

@@ -41,8 +41,7 @@ from coopenv.api.terms.records import (
 from coopenv.estimation.linalg import rotation_angle
 from coopenv.scenario import Scenario, terms
 from coopenv.scenario.terms import OBSERVATION_FIELDS, READINGS, REWARD_TERMS
-from coopenv.world.launch import kernel
-from coopenv.world.model import DRIVEN, Precision, model_struct
+from coopenv.world.model import DRIVEN, Precision
 from coopenv.world.quality import (
     cholesky_of,
     gramian_smallest_eigenvalue,
@@ -54,7 +53,7 @@ from coopenv.world.quality import (
 )
 from coopenv.world.referee import COLLIDED, OFF_ROUTE
 from coopenv.world.route import UNDER_WAY, remaining_way
-from coopenv.world.state import FLAG, NUMBER, array, state_struct, whole
+from coopenv.world.state import FLAG, NUMBER, array, whole
 from coopenv.world.warp_internals import device_function
 
 
@@ -356,13 +355,6 @@ def step_results(
         write_entries(results.observation, world, vehicle, n, table.landmark, landmark_values(landmark))
         if records.landmark.shape[2] > 0:
             records.landmark[world, vehicle, n] = landmark
-
-
-@cache
-def results_kernel(p: Precision) -> wp.Kernel:
-    """Return `step_results` for a precision."""
-    records = {"model": model_struct(p), "state": state_struct(p), "results": results_struct(p)}
-    return wp.overload(kernel(step_results, p.name), records)
 
 
 def team_results(
