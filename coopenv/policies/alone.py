@@ -33,12 +33,12 @@ class Alone:
         self.agents = list(getattr(self._driver, "agents", ())) or list(scenario.vehicle_names)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Begin new episodes in the rows of a mask."""
+        """Begin new episodes in the rows of a mask (rows,), bool."""
         restart(self._driver, mask)
         self._waited = np.where(mask, 0.0, self._waited) if len(mask) == len(self._waited) else np.zeros(len(mask))
 
     def __call__(self, observations: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Return actions (rows, A), those of the agent in rows of vehicles that are alone."""
+        """Return actions (rows, A) for observations (rows, D), those of the agent for vehicles that are alone."""
         if len(observations) != len(self._waited):
             self.reset(np.ones(len(observations), dtype=bool))
         self._waited += 1.0

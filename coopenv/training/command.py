@@ -108,14 +108,13 @@ def possible(plan: TrainingPlan) -> Scenario:
         tensors_of(plan.settings.start, scenario)
     for name in plan.settings.evaluation.drivers:
         check_agent(name, "driver (evaluation.drivers)")
-    settings = plan.settings
     try:
         rule = "right_of_way"
-        if settings.right_of_way:
+        if plan.settings.right_of_way:
             RightOfWay(scenario)
         rule = "alone"
-        if settings.alone is not None:
-            Alone(scenario, settings.alone)
+        if plan.settings.alone is not None:
+            Alone(scenario, plan.settings.alone)
     except (CoopenvError, ValueError) as error:
         raise CoopenvError(f"{rule}: {error}") from None
     for own in plan.watched():

@@ -31,11 +31,12 @@ class PictureWindow:
         """Show an (H, W, 3) uint8 picture and let the window react to the user, who may close it for good."""
         if self._image is None and not self._silent:
             self._image = _opened(self._title, picture)
-        from matplotlib import pyplot as plt
-
         if self._image is None:
             self._silent = True
-        elif plt.fignum_exists(self._image.figure.number):
+            return
+        from matplotlib import pyplot as plt
+
+        if plt.fignum_exists(self._image.figure.number):
             self._image.set_data(picture)
             self._image.figure.canvas.draw_idle()
             self._image.figure.canvas.flush_events()

@@ -27,7 +27,7 @@ from coopenv.scenario.sensing import Camera
 from coopenv.viz.perspective import Lens, _before, camera_image, pixels
 from coopenv.viz.stage import Box, Stage, camera_fan, ellipses, free_lengths, limits
 from coopenv.viz.style import ORANGE, vehicle_colour
-from coopenv.viz.topview import TopView
+from coopenv.viz.topview import PictureWindow, TopView
 from coopenv.viz.topview_ground import HEIGHT, MAP_WIDTH, PANEL, ROW, TABLE_TOP, WIDTH, touching
 from tests.helpers.builders import scenario
 from tests.helpers.env_suite import ALIKE, each_slow
@@ -309,6 +309,16 @@ def test_window_is_reused_and_stays_away_once_closed_by_the_user(monkeypatch: py
     assert len(plt.get_fignums()) == len(already) + 1
     view.close()
     assert set(plt.get_fignums()) == already
+
+
+def test_without_a_usable_toolkit_the_window_stays_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Importing it may fail, in whatever way; nothing is asked of it later."""
+    monkeypatch.delattr(mpl, "pyplot", raising=False)
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    window = PictureWindow("a window")
+    for _ in range(2):
+        window.show(np.zeros((4, 4, 3), dtype=np.uint8))
+    window.close()
 
 
 def test_drawn_routes_and_goals_are_where_the_state_says() -> None:

@@ -48,7 +48,8 @@ class BagFile:
     def __init__(self, path: Path, colours: bool = False) -> None:
         """Open a bag; compressed frames are decoded with colours or in shades of grey.
 
-        Raises DataError: no such bag, none at all, or damaged beyond reading.
+        Raises:
+            DataError: no such bag, none at all, or damaged beyond reading.
         """
         self.path, self._colours = path, colours
         if not path.exists():

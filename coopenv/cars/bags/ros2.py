@@ -74,7 +74,8 @@ def write_bag(recording: Recording, folder: str | Path, estimates: Run | None = 
         folder: of the bag.
         estimates: of an observer on the recording, for the topics `estimate`; None: they are absent.
 
-    Raises OutputError: the folder cannot be written.
+    Raises:
+        OutputError: the folder cannot be written.
     """
     from rosbags.rosbag2 import StoragePlugin, Writer
 

@@ -244,9 +244,14 @@ class Room:
 def survey(bags: Sequence[Path], like: str, folder: Path, truth: bool = True) -> Survey:
     """Solve the places of all markers of a drive, and write `environment.toml` and `topics.toml` into a folder.
 
-    Cameras, noise and observer are those of the environment that it is like; `truth`: whether motion capture counts.
+    Args:
+        bags: of one drive.
+        like: environment whose cameras, noise and observer count.
+        folder: where the files go.
+        truth: whether motion capture counts.
 
-    Raises CoopenvError: a bag cannot be read, or the drive does not determine the places.
+    Raises:
+        CoopenvError: a bag cannot be read, or the drive does not determine the places.
     """
     template, title = load_scenario(like), listed([path.name for path in bags])
     with ExitStack() as stack:

@@ -184,7 +184,8 @@ class FakeCamera:
     def __post_init__(self) -> None:
         """Put it on the car.
 
-        Raises CoopenvError: it publishes frames, and the extra is not installed, or the family has no such markers.
+        Raises:
+            CoopenvError: it publishes frames, and the extra is not installed, or the family has no such markers.
         """
         world, binding = self.world, self.binding
         self._markers = {target: marker for marker, target in binding.targets.items()}
