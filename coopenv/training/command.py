@@ -105,7 +105,7 @@ def possible(plan: TrainingPlan) -> Scenario:
     if not any(scenario.acting):
         raise CoopenvError(f"{plan.environment}: all motion is prescribed or has a driver, there is nothing to learn")
     if plan.settings.start is not None:
-        tensors_of(plan.settings.start, scenario)
+        tensors_of(plan.settings.start, scenario, plan.settings.ppo.observation_clip)
     for name in plan.settings.evaluation.drivers:
         check_agent(name, "driver (evaluation.drivers)")
     try:

@@ -272,8 +272,14 @@ def continued_settings(path: Path, environment: str, **changes: Any) -> Settings
     """Return the settings of a training that continues the agent of a file: its own ones.
 
     Of a clone alone neither reward nor PPO were ever in use: it goes on as the arm `team` does.
+
+    Raises:
+        CoopenvError: a network over sets, which is a clone alone; or see `read_settings`.
     """
-    if read_toml(path).get("steps") != 0:
+    begun = read_toml(path)
+    if begun.get("network"):
+        raise CoopenvError(f"start: {changes['start']} is no policy that PPO learns, but a clone alone")
+    if begun.get("steps") != 0:
         return read_settings(path, None, environment, **changes)
     team = read_settings(data_directory("agents") / SETTINGS_FILE, "team", environment, **changes)
     own = read_settings(path, None, environment, **{**changes, "steps": team.steps})

@@ -170,8 +170,13 @@ def regress(
             optimiser.step()
 
 
-def tensors_of(name: str, scenario: Scenario) -> Arrays:
+def tensors_of(name: str, scenario: Scenario, clip: float) -> Arrays:
     """Return the tensors of a learned agent that a training in a scenario can continue.
+
+    Args:
+        name: of the agent, or its folder.
+        scenario: of the training.
+        clip: bound of normalised observations in the training.
 
     Raises:
         CoopenvError: there is no such agent, it is another kind of driver, or it observes something else.
@@ -182,6 +187,8 @@ def tensors_of(name: str, scenario: Scenario) -> Arrays:
     agent.policy(scenario)
     if (agent.network.observation, agent.network.action) != here:
         raise CoopenvError(f"start: {name} was trained with other fields or scales of the observation")
+    if agent.network.clip != clip:
+        raise CoopenvError(f"start: {name} needs ppo.observation_clip = {agent.network.clip:g}, got {clip:g}")
     return load_weights(agent.folder / agent.network.weights, agent.network.sha256)
 
 
@@ -257,7 +264,7 @@ class Trainer:
         """Begin as an agent or a clone, where settings name one, and start episodes; `report` gets progress lines."""
         start, widths = self.plan.settings.start, self.plan.settings.ppo.hidden
         if start is not None:
-            tensors = tensors_of(start, self.scenario)
+            tensors = tensors_of(start, self.scenario, self.plan.settings.ppo.observation_clip)
             try:
                 self.take(tensors)
             except (RuntimeError, KeyError, ValueError) as error:

@@ -282,6 +282,11 @@ def test_an_environment_that_changed_since(here: Path, capsys: pytest.CaptureFix
         (["train", "overtaking"], "all motion is prescribed or has a driver, there is nothing to learn"),
         (["train", "urban_crossing", "--from", "peek"], "start: peek is no policy that PPO learns"),
         (["train", "urban_crossing", "--from", "facade_quality"], "it was trained with another observation"),
+        (["train", "open_square", "--from", "general"], "start: general is no policy that PPO learns"),
+        (
+            ["train", "facade", "--from", "facade_quality", "--settings", "clip.toml"],
+            "start: facade_quality needs ppo.observation_clip = 6, got 5",
+        ),
         (["train", "urban_crossing", "--agent", "route_follower"], "--agent route_follower: there is no train.toml"),
         (["train", "urban_crossing", "--agent", "route_follower", "--settings", "train.toml"], "give one of them"),
         (["train", "urban_crossing", "--arm", "x"], "no arm 'x'; known: none"),
@@ -302,6 +307,7 @@ def test_mistakes_are_one_line(
         ("alone", "alone = 'peek'"),
         ("wrong", "alone = 'nobody'"),
         ("own", "alone = 'mine.py:Mine'"),
+        ("clip", "ppo.observation_clip = 5.0"),
     ):
         (here / f"{name}.toml").write_text(line)
     assert main(arguments) == 2
