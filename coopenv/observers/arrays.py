@@ -38,10 +38,6 @@ def _sent(values: Array, others: Fields, model: Any) -> Mask:
     return np.asarray((values == -1) | ((values >= 0) & (values <= others["now"]) & (values % others["period"] == 0)))
 
 
-def _is_late(scenario: "Scenario | None") -> bool:
-    return scenario is not None and any(camera.is_late for camera in scenario.cameras)
-
-
 VECTOR = Rule(f"finite numbers of at most {LARGEST:g}", _vector, axes=1)
 ROTATION = Rule("a rotation", lambda values, others, model: are_rotations(values), axes=2)
 DIRECTION = Rule("unit vectors, or NaN where nothing is visible", _direction, axes=1)
@@ -89,7 +85,9 @@ ARRAYS = {
     "pan": ArraySpec(
         "KN", ANGLE, optional=0.0, present=lambda scenario: scenario is not None and scenario.action.pan is not None
     ),
-    "bearing_age": ArraySpec("KN", AGE, optional=0.0, present=_is_late),
+    "bearing_age": ArraySpec(
+        "KN", AGE, optional=0.0, present=lambda s: s is not None and any(c.is_late for c in s.cameras)
+    ),
     "truth.rotation": ArraySpec("KN33", ROTATION._replace(of_truth=True)),
     "truth.position": ArraySpec("KN3", VECTOR._replace(of_truth=True)),
     "odometry_age": ArraySpec("KN", AGE, recorded=False, optional=0.0),

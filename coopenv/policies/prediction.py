@@ -136,7 +136,7 @@ class Occluders:
         self._sizes: list[Body | None] = []
         if {"message_position", "message_forward", "message_mask"} <= {*layout}:
             # Slot n is vehicle n, or n + 1 for those that come before it: the larger is the safe guess.
-            self._sizes = [max(pair, key=_footprint) for pair in pairwise(bodies)]
+            self._sizes = [max(pair, key=lambda b: b.size[0] * b.size[1] if b else 0.0) for pair in pairwise(bodies)]
         located = {"estimate_position", "estimate_forward"} <= {*layout}
         self._buildings = scenario.obstacles if located else ()
         self._origin = np.array(scenario.map.origin[:2])
@@ -177,10 +177,6 @@ class Occluders:
             half, top = (house.size[0] / 2, house.size[1] / 2), house.center[2] + house.size[2] / 2
             there = np.ones(len(place), dtype=bool)
             yield Occluder(np.einsum("rij,rj->ri", turn, center), forward, half, self._below(top), there, moves=False)
-
-
-def _footprint(body: Body | None) -> float:
-    return body.size[0] * body.size[1] if body else 0.0
 
 
 def unhidden(

@@ -171,12 +171,7 @@ def regress(
 
 
 def tensors_of(name: str, scenario: Scenario, clip: float) -> Arrays:
-    """Return the tensors of a learned agent that a training in a scenario can continue.
-
-    Args:
-        name: of the agent, or its folder.
-        scenario: of the training.
-        clip: bound of normalised observations in the training.
+    """Return the tensors of a learned agent that a training with observations up to `clip` can continue.
 
     Raises:
         CoopenvError: there is no such agent, it is another kind of driver, or it observes something else.
