@@ -195,4 +195,6 @@ def _of_vehicle(r: Recording, i: int, static: NDArray[np.int64]) -> CarStreams:
         numbers={},
         wheelbase=math.inf if scenario is None else scenario.limits[i].wheelbase,
         scale_noise=setup.noise.odometry_scale,
+        noise={"gyro": setup.noise.angular_velocity, "wheel": setup.noise.velocity},
+        odometry_rate=1.0 / setup.noise.odometry_period,
     )

@@ -17,7 +17,7 @@ from coopenv.cars.bags.clocks import CAMERAS
 from coopenv.cars.calibration.drives import CalibrationDrive
 from coopenv.cars.doctor.constants import of_constants
 from coopenv.cars.doctor.finding import Diagnosis, Finding, Treatment
-from coopenv.cars.doctor.motion import of_frozen_streams, of_turning, of_velocity, turns_contradict
+from coopenv.cars.doctor.motion import of_frozen_streams, of_noise, of_turning, of_velocity, turns_contradict
 from coopenv.cars.doctor.sight import exchanged_bodies, of_sight
 from coopenv.cars.doctor.streams import MOVING, TURNING, CarStreams, Streams
 from coopenv.cars.doctor.turning import constant_turn_rate
@@ -94,7 +94,8 @@ def examine_cars(cars: Iterable[CarStreams], trusted: Collection[str] = ()) -> E
                 found.mends.append(mend)
             elif each.change is None:
                 found.spoilt.add(name)
-        found.findings += [treated(finding, trusted) for finding in _of_detections(car)]
+        others = (*_of_detections(car), *of_noise(found.cars[name]))
+        found.findings += [treated(finding, trusted) for finding in others]
     return found
 
 

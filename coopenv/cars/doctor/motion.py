@@ -367,3 +367,28 @@ def frozen(time: Array, values: NDArray[Any]) -> Iterator[tuple[float, float, in
     for first, last in zip(np.append(0, ends[:-1] + 1).tolist(), ends.tolist(), strict=False):
         if time[last] - time[first] > FROZEN:
             yield float(time[first]), float(time[last]), first
+
+
+FEWEST, NOISIER = 100, 3.0
+"""Samples at least; times its declared deviation from which on noise is a finding: information counts tenfold."""
+BEND = 1.4826 / math.sqrt(6.0)
+"""Deviation of white noise over the median size of its second differences."""
+
+
+def of_noise(car: CarStreams) -> Iterator[Finding]:
+    """Yield streams with far more noise than declared, by their second differences, in which motion hardly counts."""
+    for kind, what, roles, key in (
+        ("wheel", "velocity", MOVING, "noise.velocity"),
+        ("gyro", "turn rate", TURNING, "noise.angular_velocity"),
+    ):
+        time, values = car.tracks[f"{kind}_time"], car.tracks[kind].real
+        if len(time) < FEWEST or not car.noise[kind]:
+            continue
+        period = float(np.median(np.diff(time)))
+        std = BEND * float(np.median(np.abs(np.diff(values, 2)))) * math.sqrt(period * car.odometry_rate)
+        ratio = std / car.noise[kind]
+        if ratio > NOISIER:
+            size = with_error(ratio, ratio / math.sqrt(len(time)))
+            text = f"the noise of the {what} of {car.name} is {size} times the declared one"
+            mended = f'overrides."{key}" = {std:.3g}'
+            yield Finding(car.topic(roles), text, ratio, ratio / math.sqrt(len(time)), mended, car=car.name)

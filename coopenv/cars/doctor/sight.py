@@ -7,11 +7,11 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import listed
@@ -29,8 +29,10 @@ from coopenv.estimation.poses import Array
 FEWEST, MOST = 12, 300  # sightings
 BAD = 0.004
 """Mean misfit, of angles of 3.6 deg, above which a coarse cause is looked for; smaller ones are calibration's."""
-OFF_DEG, MOST_OFF = 3.6, 0.8
-"""Angle of a ray that is off, deg, and share of the rays to a landmark that is elsewhere."""
+OFF_DEG, LARGEST_DEG, MOST_OFF = 3.6, 12.0, 0.8
+"""Angles of a ray that is off, and beyond which it counts no more, deg; share of the rays to a landmark elsewhere."""
+AS_GIVEN = 0.3
+"""Share of their angles by which bearings may be nearer to other landmarks than to those of their markers."""
 REMOVED = 0.35
 """Share of the misfit that the cause leaves at most."""
 SMALL_DEG, SMALL_LOG, SMALL_M = 6.0, math.log(1.2), 0.3
@@ -153,23 +155,10 @@ def of_lens(right: Calibration) -> Change:
     return change
 
 
-def exchanged_targets(i: int, j: int) -> Change:
-    """Return the change of two landmarks into each other."""
-
-    def change(car: CarStreams) -> CarStreams:
-        return replace(car, target=np.where(car.target == i, j, np.where(car.target == j, i, car.target)))
-
-    return change
-
-
 def causes(car: CarStreams, every: bool = True) -> Iterator[Cause]:
     """Yield the possible causes; not `every`: those without a search."""
-    for i, j in combinations(sorted(set(car.target.tolist())), 2) if every else ():
-        right = {i: car.numbers.get(j), j: car.numbers.get(i)}
-        entries = (f"{car.names[k]} = {right.get(k, number)}" for k, number in sorted(car.numbers.items()))
-        key = f"markers = {{ {', '.join(entries)} }}"
-        text = f"markers {car.names[i]} and {car.names[j]} are exchanged"
-        yield Cause("markers", text, exchanged_targets(i, j), key=key)
+    if every:
+        yield from _of_numbers(car)
     for unit, metres in UNITS.items():
         yield Cause("landmarks", f"positions of landmarks are in {unit}, and not in m", of_map(metres * np.eye(3)))
     for what, signs in MIRRORS.items():
@@ -185,11 +174,31 @@ def causes(car: CarStreams, every: bool = True) -> Iterator[Cause]:
         yield Cause("", "", lambda car, s=seconds: car.shifted(role, s), free=1)  # type: ignore[misc]
 
 
+def _of_numbers(car: CarStreams) -> Iterator[Cause]:
+    """Yield the assignment of marker numbers to landmarks in which bearings are least off, if it is another one."""
+    every, given = np.arange(len(car.places)), sight_of(car).target
+    toward = (sight_of(replace(car, target=np.full_like(car.target, n))).off_deg() for n in every)
+    off = [np.bincount(given, np.minimum(angles, LARGEST_DEG), len(every)) for angles in toward]
+    right = linear_sum_assignment(np.array(off).T * (1.0 - AS_GIVEN * np.eye(len(every))))[1]
+    moved = [n for n in np.flatnonzero(right != every).tolist() if n in given]
+    if moved:
+        numbers = {int(right[n]): number for n, number in car.numbers.items() if n in given or right[n] == n}
+        key = f"markers = {{ {', '.join(f'{car.names[k]} = {number}' for k, number in sorted(numbers.items()))} }}"
+        names, places = ([car.names[n] for n in some] for some in (moved, right[moved]))
+        text = f"markers {listed(names)} stand at {listed(places)}"
+        if {*names} == {*places} and len(names) == 2:
+            text = f"markers {names[0]} and {names[1]} are exchanged"
+        yield Cause("markers", text, lambda car: replace(car, target=right[car.target]), key=key)
+
+
 def _of_truth(car: CarStreams) -> Iterator[Cause]:
     topic = car.topic([Role.TRUTH])
     for unit, metres in UNITS.items():
         yield Cause(topic, f"it is in {unit}, and not in m", of_truth(lambda p, k=metres: k * p, _same))  # type: ignore[misc]
     yield Cause(topic, "it is mirrored: y has the other sign", of_truth(np.conj, np.negative))
+    for what, (x, y) in MIRRORS.items():
+        mirrored = of_truth(lambda p, x=x, y=y: x * p.real + 1j * y * p.imag, _same)  # type: ignore[misc]
+        yield Cause(topic, f"{what}, and its heading is right", mirrored)
     yield Cause(topic, "its heading has the other sign", of_truth(_same, np.negative))
     for deg in (90.0, -90.0, 180.0):
         turned = of_truth(_same, lambda yaw, d=deg: yaw + math.radians(d))  # type: ignore[misc]
@@ -320,10 +329,13 @@ def of_sight(given: CarStreams) -> Iterator[Diagnosis]:
     if (few := sight.misfit() < BAD) and not sight.misplaced():
         return
     topic, found, changed = car.topic([Role.TRUTH]), explanation(car) if lasts else [], car
-    if few and lasts and not found:
+    if lasts and not found and (few or np.median(sight.off_deg()) < OFF_DEG):
         names = listed([car.names[k] for k in sight.misplaced()])
         text = f"most bearings of {car.name} to landmark {names} are off by more than {OFF_DEG} deg: is it elsewhere?"
-        yield Diagnosis(Finding("landmarks", text, car=car.name, explained=False))
+        if not few:
+            text = f"{sight.off_share():.0%} of the bearings of {car.name} are off by more than {OFF_DEG} deg, and the "
+            text += "others fit: false detections, a camera that was moved, or jumps of motion capture?"
+        yield Diagnosis(Finding("landmarks" if few else car.topic(CAMERAS), text, car=car.name, explained=False))
         return
     for cause in found:
         changed = cause.change(changed)

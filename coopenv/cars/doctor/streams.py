@@ -62,6 +62,9 @@ class CarStreams(CarSight):
     wheelbase: float
     scale_noise: float
     """Standard deviation of the scale of velocities, as the environment draws it."""
+    noise: Mapping[str, float]
+    """Declared deviations of turn rates ("gyro"), rad/s, and velocities ("wheel"), m/s, at the next rate, Hz."""
+    odometry_rate: float
 
     def topic(self, roles: Sequence[Role]) -> str:
         """Return the topic of the first of some roles that the car has."""
@@ -167,6 +170,7 @@ class Streams:
         poses = [(s.stamp, p) for s in twists if isinstance(p := s.value.pose, CarPose) and p.rotation is not None]  # type: ignore[union-attr]
         vehicle, scenario = self.binding.cars[name], self.binding.scenario
         camera, begin = scenario.cameras[vehicle], scenario.vehicles[vehicle].initial_pose
+        noise = scenario.noises[vehicle]
         return CarStreams(
             name=name,
             vehicle=vehicle,
@@ -188,5 +192,7 @@ class Streams:
             names=tuple(scenario.landmarks[i].name for i in standing),
             numbers={standing.index(t): n for n, t in self.binding.targets.items() if t in standing},
             wheelbase=scenario.limits[vehicle].wheelbase,
-            scale_noise=scenario.noises[vehicle].odometry_scale,
+            scale_noise=noise.odometry_scale,
+            noise={"gyro": noise.angular_velocity, "wheel": noise.velocity},
+            odometry_rate=scenario.rates.odometry if noise.odometry_rate == "sample" else noise.odometry_rate,
         )

@@ -126,6 +126,16 @@ def seen(ray: Callable[[np.ndarray], np.ndarray], number: Callable[[int], int] =
     return change
 
 
+def shaken(value: Any, t: float) -> Any:
+    noise = 0.3 * np.random.default_rng(round(1e6 * t)).normal(size=3)
+    return replace(value, angular=value.angular + noise) if getattr(value, "angular", None) is not None else value
+
+
+def sometimes_elsewhere(ray: np.ndarray) -> np.ndarray:
+    rng = np.random.default_rng(round(1e9 * abs(float(ray[0, 0]))))
+    return ray + 0.5 * rng.normal(size=ray.shape) * [1.0, 1.0, 0.0] * (rng.random((len(ray), 1)) < 0.2)
+
+
 def stuck(value: Any, t: float) -> Any:
     return CarPose(np.array([0.3, 0.2, 0.0]), turn(1.0)) if isinstance(value, CarPose) and 8.0 < t < 14.0 else value
 
@@ -148,12 +158,18 @@ FAULTS: dict[str, tuple[Change, str, Treatment | None]] = {
     "gyro of a wrong scale": (twist(angular=1.3), r"turn rate of car is 1\.(30|29)\d*\(", Treatment.REFUSED),
     "gyro is zero": (twist(angular=0.0), "turn rate of car is 0 rad/s in all", Treatment.REFUSED),
     "gyro ends": (twist(angular=0.0, after=12.0), "turn rate of car is 0 rad/s in a row for 12", Treatment.REFUSED),
+    "gyro with noise": (shaken, r"noise of the turn rate of car is \d+\.\d\(\d+\) times the declared", Treatment.USED),
     "gyro with other axes": (axes, "turns about the x axis", Treatment.REFUSED),
     "wheels reversed": (twist(linear=-1.0), "velocity of car .* other sign", Treatment.MENDED),
     "wheels in km/h": (twist(linear=3.6), "velocity of car .*km/h instead of m/s", Treatment.MENDED),
     "wheels end": (twist(linear=0.0, after=12.0), "velocity of car is 0 m/s in a row", Treatment.REFUSED),
     "truth in mm": (pose(lambda p: 1000.0 * p, float), "motion capture of car.* it is in mm", Treatment.USED),
     "truth mirrored": (pose(lambda p: p * [1, -1, 1], lambda a: -a), "motion capture .* mirrored", Treatment.USED),
+    "truth with one other sign": (
+        pose(lambda p: p * [-1, 1, 1], float),
+        "motion capture .* x has the other sign, and its heading is right",
+        Treatment.USED,
+    ),
     "truth in another frame": (
         pose(lambda p: turn(0.6) @ p + [1.0, 0.0, 0.0], lambda a: a + 0.6),
         r"its frame is -34\.\d deg",
@@ -164,6 +180,16 @@ FAULTS: dict[str, tuple[Change, str, Treatment | None]] = {
     "image mirrored": (seen(lambda ray: ray * [-1, 1, 1]), "its image is mirrored", Treatment.REFUSED),
     "twice the focal length": (seen(narrow(2.0)), r"focal length is (2\.0|1\.9)\d*\(\d+\) times", Treatment.REFUSED),
     "markers exchanged": (seen(same, lambda n: {1: 4, 4: 1}.get(n, n)), "SL1 and SL5 are exchanged", Treatment.REFUSED),
+    "every marker one further": (
+        seen(same, lambda n: n % 5 + 1),
+        r"SL1, SL2, SL4, SL5, ML stand at ML, SL1, SL2, SL4, SL5.* = \{ SL1 = 2, SL2 = 3, .* ML = 1 \}",
+        Treatment.REFUSED,
+    ),
+    "false detections": (
+        seen(sometimes_elsewhere),
+        r"1\d% of the bearings of car are off .*, and the others fit: false detections",
+        Treatment.USED,
+    ),
     "focal length 3 % off": (seen(narrow(1.03)), "focal length: a wrong constant", Treatment.USED),
     "camera to the right": (
         seen(lambda ray: ray @ np.array([[0.9962, 0, 0.0872], [0, 1, 0], [-0.0872, 0, 0.9962]])),
