@@ -406,6 +406,15 @@ def test_a_camera_with_another_rate_is_reported(tmp_path: Path) -> None:
         opened(tmp_path, MAP.replace("[overrides]", '[overrides]\n"rates.camera" = 30.0\n"rates.observer" = 30.0'))
 
 
+def test_odometry_that_comes_seldom_is_reported(tmp_path: Path) -> None:
+    """The environment has five times as many samples; twice as many are common."""
+    rate = re.search(r'"rates.odometry" = (\d+)', MAP)
+    assert rate is not None
+    often = MAP.replace(rate[0], f'"rates.odometry" = {5 * int(rate[1])}')
+    with pytest.warns(DataWarning, match=rf'messages per second, the environment has {5 * int(rate[1])}: .*"rates.odo'):
+        opened(tmp_path, often)
+
+
 def test_the_rate_of_a_camera_may_be_any(tmp_path: Path) -> None:
     """The environment's decisions are 20 Hz; a recording has none."""
     for rate in (15.0, 50.0, 59.4):
