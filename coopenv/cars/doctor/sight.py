@@ -7,11 +7,11 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import listed
@@ -20,6 +20,7 @@ from coopenv.cars.calibration.calibrate import INTRINSICS
 from coopenv.cars.calibration.drives import LEAST_SECONDS
 from coopenv.cars.calibration.resection import misfits, seen_from
 from coopenv.cars.doctor.finding import Change, Diagnosis, Finding, Treatment, with_error
+from coopenv.cars.doctor.motion import NAMED, turning_factor, velocity_relations
 from coopenv.cars.doctor.streams import CarStreams, Planar
 from coopenv.cars.messages.vision import Calibration, rays
 from coopenv.cars.settings.profile import Role
@@ -29,8 +30,8 @@ from coopenv.estimation.poses import Array
 FEWEST, MOST = 12, 300  # sightings
 BAD = 0.004
 """Mean misfit, of angles of 3.6 deg, above which a coarse cause is looked for; smaller ones are calibration's."""
-OFF_DEG, MOST_OFF = 3.6, 0.8
-"""Angle of a ray that is off, deg, and share of the rays to a landmark that is elsewhere."""
+OFF_DEG, LARGEST_DEG, MOST_OFF = 3.6, 12.0, 0.8
+"""Angles of a ray that is off, and beyond which it counts no more, deg; share of rays to a landmark elsewhere."""
 REMOVED = 0.35
 """Share of the misfit that the cause leaves at most."""
 SMALL_DEG, SMALL_LOG, SMALL_M = 6.0, math.log(1.2), 0.3
@@ -153,23 +154,10 @@ def of_lens(right: Calibration) -> Change:
     return change
 
 
-def exchanged_targets(i: int, j: int) -> Change:
-    """Return the change of two landmarks into each other."""
-
-    def change(car: CarStreams) -> CarStreams:
-        return replace(car, target=np.where(car.target == i, j, np.where(car.target == j, i, car.target)))
-
-    return change
-
-
 def causes(car: CarStreams, every: bool = True) -> Iterator[Cause]:
     """Yield the possible causes; not `every`: those without a search."""
-    for i, j in combinations(sorted(set(car.target.tolist())), 2) if every else ():
-        right = {i: car.numbers.get(j), j: car.numbers.get(i)}
-        entries = (f"{car.names[k]} = {right.get(k, number)}" for k, number in sorted(car.numbers.items()))
-        key = f"markers = {{ {', '.join(entries)} }}"
-        text = f"markers {car.names[i]} and {car.names[j]} are exchanged"
-        yield Cause("markers", text, exchanged_targets(i, j), key=key)
+    if every:
+        yield from _of_numbers(car)
     for unit, metres in UNITS.items():
         yield Cause("landmarks", f"positions of landmarks are in {unit}, and not in m", of_map(metres * np.eye(3)))
     for what, signs in MIRRORS.items():
@@ -185,11 +173,31 @@ def causes(car: CarStreams, every: bool = True) -> Iterator[Cause]:
         yield Cause("", "", lambda car, s=seconds: car.shifted(role, s), free=1)  # type: ignore[misc]
 
 
+def _of_numbers(car: CarStreams) -> Iterator[Cause]:
+    """Yield the assignment of numbers to landmarks in which bearings are least off, if it is another one."""
+    every, sight = np.arange(len(car.places)), sight_of(car)
+    toward = (sight_of(replace(car, target=np.full_like(car.target, n))).off_deg() for n in every)
+    off = [np.bincount(sight.target, np.minimum(angles, LARGEST_DEG), len(every)) for angles in toward]
+    right = linear_sum_assignment(np.array(off).T * (1.0 - 0.3 * np.eye(len(every))))[1]
+    moved = [n for n in np.flatnonzero(right != every).tolist() if n in sight.target]
+    if moved:
+        names, numbers = car.names, {int(right[n]): number for n, number in car.numbers.items()}
+        entries = (f"{names[k]} = {number}" for k, number in sorted(numbers.items()))
+        text = f"markers {listed([names[n] for n in moved])} stand at {listed([names[right[n]] for n in moved])}"
+        if len(moved) == 2:
+            text = f"markers {names[moved[0]]} and {names[right[moved[0]]]} are exchanged"
+        key = f"markers = {{ {', '.join(entries)} }}"
+        yield Cause("markers", text, lambda car: replace(car, target=right[car.target]), key=key)
+
+
 def _of_truth(car: CarStreams) -> Iterator[Cause]:
     topic = car.topic([Role.TRUTH])
     for unit, metres in UNITS.items():
         yield Cause(topic, f"it is in {unit}, and not in m", of_truth(lambda p, k=metres: k * p, _same))  # type: ignore[misc]
     yield Cause(topic, "it is mirrored: y has the other sign", of_truth(np.conj, np.negative))
+    for what, (x, y) in MIRRORS.items():
+        one = of_truth(lambda p, x=x, y=y: x * p.real + 1j * y * p.imag, _same)  # type: ignore[misc]
+        yield Cause(topic, f"the {what}, and its heading has the right one", one)
     yield Cause(topic, "its heading has the other sign", of_truth(_same, np.negative))
     for deg in (90.0, -90.0, 180.0):
         turned = of_truth(_same, lambda yaw, d=deg: yaw + math.radians(d))  # type: ignore[misc]
@@ -329,9 +337,9 @@ def of_sight(given: CarStreams) -> Iterator[Diagnosis]:
         changed = cause.change(changed)
     rest = f", and {sight_of(changed).off_share():.0%} with that mended" if found else ""
     ask = " (are heading, unit and frames.truth right?)"
-    for cause in found or [Cause(topic, "no single cause explains it", _same)]:
+    for cause in found or [_unexplained(given, sight) if lasts else Cause(topic, NO_CAUSE, _same)]:
         off = f"{sight.off_share():.0%} of the bearings are off by more than {OFF_DEG} deg{rest}"
-        text, treatment = f"{cause.text}: {off}", Treatment.REFUSED
+        text, treatment = f"{cause.text}: {off}", Treatment.REFUSED if found or cause.key else Treatment.USED
         if cause.subject == topic:
             off = f"{np.median(sight.off_deg()):.0f} deg off the bearings to landmarks (median)"
             text = f"motion capture of {car.name}, topic {topic}, is {_far(car, sight) or off}: {cause.text}{ask}"
@@ -339,6 +347,26 @@ def of_sight(given: CarStreams) -> Iterator[Diagnosis]:
         if cause.subject and not cause.small:
             about = Finding(cause.subject, text, cause.size, cause.error, cause.key, treatment, car.name, bool(found))
             yield Diagnosis(about, cause.change if found else None, cause.parts)
+
+
+NO_CAUSE, MINOR = "no single cause explains it", 0.5
+"""Words of a misfit without a cause, and share of bearings that are off below which most of them are right."""
+
+
+def _unexplained(car: CarStreams, sight: PosedSightings) -> Cause:
+    """Return the streams that are to blame for a misfit without a cause; a key where the drive is refused.
+
+    If most bearings fit, it is detections; if wheels and gyro follow motion capture, it is no stream but the map.
+    """
+    assert car.truth_signals is not None
+    if sight.off_share() < MINOR:
+        text = "other things or mistaken numbers among detections, or a marker that moves"
+        return Cause(car.topic(CAMERAS), text, _same)
+    turned, (moved, _) = turning_factor(car, car.truth_signals[1]), velocity_relations(car, *car.truth_signals)
+    if turned is not None and moved is not None and max(abs(r.factor - 1.0) for r in (turned, moved)) < NAMED:
+        text = f"with motion capture, which wheels and gyro follow, bearings do not fit the map: {NO_CAUSE}"
+        return Cause("landmarks", text, _same, key="`coopenv calibrate --propose`, which solves a map")
+    return Cause(car.topic([Role.TRUTH]), NO_CAUSE, _same)
 
 
 TRIED = 4  # first causes to which every second one is tried; to the others those that need no search

@@ -164,6 +164,16 @@ FAULTS: dict[str, tuple[Change, str, Treatment | None]] = {
     "image mirrored": (seen(lambda ray: ray * [-1, 1, 1]), "its image is mirrored", Treatment.REFUSED),
     "twice the focal length": (seen(narrow(2.0)), r"focal length is (2\.0|1\.9)\d*\(\d+\) times", Treatment.REFUSED),
     "markers exchanged": (seen(same, lambda n: {1: 4, 4: 1}.get(n, n)), "SL1 and SL5 are exchanged", Treatment.REFUSED),
+    "markers counted from the next": (
+        seen(same, lambda n: n % 5 + 1),
+        "SL1, SL2, SL4, SL5, ML stand at ML, SL1, SL2, SL4, SL5",
+        Treatment.REFUSED,
+    ),
+    "x of truth alone": (
+        pose(lambda p: p * [-1, 1, 1], float),
+        "the x has the other sign, and its heading has the right one",
+        Treatment.USED,
+    ),
     "focal length 3 % off": (seen(narrow(1.03)), "focal length: a wrong constant", Treatment.USED),
     "camera to the right": (
         seen(lambda ray: ray @ np.array([[0.9962, 0, 0.0872], [0, 1, 0], [-0.0872, 0, 0.9962]])),
@@ -341,6 +351,24 @@ def test_four_seconds_on_the_map_of_another_room_have_no_cause(begin: float) -> 
     other = streams_of(None, places=PLACES[[2, 3, 1, 4, 0]] * [0.8, 1.2, 1.0] + [0.3, -0.2, 0.0])
     found = examine(replace(other, samples=cut(driven(), begin, 4.0))).findings
     assert all(f.subject == "/car/truth" and "no single cause" in f.text for f in found)
+
+
+def test_the_map_of_another_room_is_to_blame_if_wheels_and_gyro_follow_motion_capture() -> None:
+    other = streams_of(None, places=PLACES[[2, 3, 1, 4, 0]] * [0.8, 1.2, 1.0] + [0.3, -0.2, 0.0])
+    [found] = examine(other).findings
+    assert found.subject == "landmarks" and found.treatment is Treatment.REFUSED and "no single cause" in found.text
+
+
+def test_ghosts_among_right_bearings_are_of_the_camera_and_not_of_motion_capture() -> None:
+    rng = np.random.default_rng(0)
+
+    def change(value: Any, _: float) -> Any:
+        if not isinstance(value, Detections) or rng.random() > 0.5:
+            return value
+        return replace(value, bearings=value.bearings[:, [1, 0, 2]] * [1.0, -1.0, 1.0])
+
+    found = examine(streams_of(change)).findings
+    assert [f.subject for f in found] == ["/car/detections"] and found[0].treatment is Treatment.USED
 
 
 def test_motion_capture_of_two_cars_that_is_exchanged_is_named_for_both() -> None:
