@@ -194,7 +194,7 @@ def _of_ros1(path: Path, allowance: Allowance) -> Entries:
     with regular(path).open("rb") as stream:
         if not stream.readline(64).startswith(b"#ROSBAG V2.0"):
             raise ValueError("no bag of ROS 1")
-        for header, data in _ros1_records(stream, allowance):
+        for header, data in _ros1_records(stream, allowance, path.stat().st_size):
             with suppress(KeyError, struct.error):  # a record that makes no sense costs no other one anything
                 (number,) = struct.unpack("<I", header[b"conn"])
                 if header[b"op"] == CONNECTION:
@@ -222,21 +222,21 @@ def _ros1_header(data: bytes) -> dict[bytes, bytes]:
     return fields
 
 
-def _ros1_records(stream: BinaryIO, allowance: Allowance) -> Iterator[tuple[dict[bytes, bytes], bytes]]:
-    """Yield header and data of connections and messages, also of the chunk in which a file breaks off.
+def _ros1_records(stream: BinaryIO, allowance: Allowance, most: int) -> Iterator[tuple[dict[bytes, bytes], bytes]]:
+    """Yield header and data of connections and messages, also of the chunk in which a file of `most` bytes breaks off.
 
     Raises EOFError: it breaks off, or has not the table of chunks that is written last.
     """
     chunks = 0  # that are not in that table
     while size := stream.read(4):
-        header = _ros1_header(stream.read(*struct.unpack("<I", size)))
+        header = _ros1_header(stream.read(min(most, *struct.unpack("<I", size))))
         op, (size,) = header.get(b"op"), struct.unpack("<I", stream.read(4))
-        data = stream.read(size)
+        data = stream.read(min(most, size))
         chunks += (op == CHUNK) - (op == CHUNK_INFO)
         if op == CHUNK:
             (claimed,) = struct.unpack("<I", header[b"size"])
             unpacked = allowance.unpack(header[b"compression"].decode(), data, claimed)
-            yield from _ros1_records(BytesIO(unpacked), allowance)
+            yield from _ros1_records(BytesIO(unpacked), allowance, len(unpacked))
         if len(data) < size:
             break
         if op in (CONNECTION, MESSAGE):

@@ -20,6 +20,7 @@ from coopenv.cars.calibration.calibrate import INTRINSICS
 from coopenv.cars.calibration.drives import LEAST_SECONDS
 from coopenv.cars.calibration.resection import misfits, seen_from
 from coopenv.cars.doctor.finding import Change, Diagnosis, Finding, Treatment, with_error
+from coopenv.cars.doctor.motion import NAMED, turning_factor, velocity_relations
 from coopenv.cars.doctor.streams import CarStreams, Planar
 from coopenv.cars.messages.vision import Calibration, rays
 from coopenv.cars.settings.profile import Role
@@ -329,21 +330,18 @@ def of_sight(given: CarStreams) -> Iterator[Diagnosis]:
     if (few := sight.misfit() < BAD) and not sight.misplaced():
         return
     topic, found, changed = car.topic([Role.TRUTH]), explanation(car) if lasts else [], car
-    if lasts and not found and (few or np.median(sight.off_deg()) < OFF_DEG):
+    if few and lasts and not found:
         names = listed([car.names[k] for k in sight.misplaced()])
         text = f"most bearings of {car.name} to landmark {names} are off by more than {OFF_DEG} deg: is it elsewhere?"
-        if not few:
-            text = f"{sight.off_share():.0%} of the bearings of {car.name} are off by more than {OFF_DEG} deg, and the "
-            text += "others fit: false detections, a camera that was moved, or jumps of motion capture?"
-        yield Diagnosis(Finding("landmarks" if few else car.topic(CAMERAS), text, car=car.name, explained=False))
+        yield Diagnosis(Finding("landmarks", text, car=car.name, explained=False))
         return
     for cause in found:
         changed = cause.change(changed)
     rest = f", and {sight_of(changed).off_share():.0%} with that mended" if found else ""
     ask = " (are heading, unit and frames.truth right?)"
-    for cause in found or [Cause(topic, "no single cause explains it", _same)]:
+    for cause in found or [_unexplained(given, sight) if lasts else Cause(topic, NO_CAUSE, _same)]:
         off = f"{sight.off_share():.0%} of the bearings are off by more than {OFF_DEG} deg{rest}"
-        text, treatment = f"{cause.text}: {off}", Treatment.REFUSED
+        text, treatment = f"{cause.text}: {off}", Treatment.REFUSED if found or cause.key else Treatment.USED
         if cause.subject == topic:
             off = f"{np.median(sight.off_deg()):.0f} deg off the bearings to landmarks (median)"
             text = f"motion capture of {car.name}, topic {topic}, is {_far(car, sight) or off}: {cause.text}{ask}"
@@ -351,6 +349,26 @@ def of_sight(given: CarStreams) -> Iterator[Diagnosis]:
         if cause.subject and not cause.small:
             about = Finding(cause.subject, text, cause.size, cause.error, cause.key, treatment, car.name, bool(found))
             yield Diagnosis(about, cause.change if found else None, cause.parts)
+
+
+NO_CAUSE, MINOR = "no single cause explains it", 0.5
+"""Words of a misfit without a cause, and share of bearings that are off below which most of them are right."""
+
+
+def _unexplained(car: CarStreams, sight: PosedSightings) -> Cause:
+    """Return the streams that are to blame for a misfit without a cause; a key where the drive is refused.
+
+    If most bearings fit, it is detections; if wheels and gyro follow motion capture, it is no stream but the map.
+    """
+    assert car.truth_signals is not None
+    if sight.off_share() < MINOR:
+        text = "most bearings fit: false detections, a marker or a camera that moved, or jumps of motion capture?"
+        return Cause(car.topic(CAMERAS), text, _same)
+    turned, (moved, _) = turning_factor(car, car.truth_signals[1]), velocity_relations(car, *car.truth_signals)
+    if turned is not None and moved is not None and max(abs(r.factor - 1.0) for r in (turned, moved)) < NAMED:
+        text = f"with motion capture, which wheels and gyro follow, bearings do not fit the map: {NO_CAUSE}"
+        return Cause("landmarks", text, _same, key="`coopenv calibrate --propose`, which solves a map")
+    return Cause(car.topic([Role.TRUTH]), NO_CAUSE, _same)
 
 
 TRIED = 4  # first causes to which every second one is tried; to the others those that need no search

@@ -1,6 +1,7 @@
 """Checks of when messages come: outages, messages that come twice, delays, and clocks that no crystal drives."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from coopenv.cars.bags.tracks import Track
 from coopenv.cars.doctor.doctor import Examined, treated
 from coopenv.cars.doctor.finding import Finding, Treatment
 from coopenv.cars.doctor.motion import IN_THE_ROOM, velocity_relations
-from coopenv.cars.doctor.streams import MOVING
+from coopenv.cars.doctor.streams import MOVING, TURNING
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist
 from coopenv.cars.settings.profile import Role
 
@@ -19,8 +20,10 @@ OUTAGE, PERIODS, OFTEN = 1.5, 20.0, 4.0
 """s, and periods of the topic, of a silence that is stated, and periods of one that may come more often."""
 FEW, SHARE = 5, 0.02
 """Messages, and their share, that come twice, above which that is stated."""
-REPEATED = 0.2
-"""Share of equal values in a row above which a stream repeats itself, of values with noise."""
+REPEATED, HELD = 0.9, (2, 3, 4, 5, 6)
+"""Share of the runs of equal values with a multiple of a length above which a stream holds values, and lengths."""
+LOST = 0.25
+"""Share of the time in gaps of over three periods: half of the messages lost at random give 0.31, and 40 % 0.16."""
 LATE = 0.25
 """s by which a twentieth of the messages come later than the earliest: a network buffers them."""
 
@@ -36,9 +39,11 @@ def of_outages(samples: Sequence[Sample], topic: str, begin: int, end: int) -> I
     gaps = np.diff(stamps) * NS
     if samples[0].role in CAMERAS and (gaps > OFTEN * np.median(gaps)).sum() > FEW and all(map(_markers, samples)):
         return
-    if gaps.max() > max(OUTAGE, PERIODS * float(np.median(gaps))):
+    wide = gaps > 3.0 * np.median(gaps)
+    lossy = samples[0].role in (*MOVING, *TURNING) and wide.sum() > FEW and gaps[wide].sum() > LOST * gaps.sum()
+    if lossy or gaps.max() > max(OUTAGE, PERIODS * float(np.median(gaps))):
         after = (stamps[int(np.argmax(gaps))] - stamps[0]) * NS
-        count = int((gaps > OUTAGE).sum())
+        count = int((wide if lossy else gaps > OUTAGE).sum())
         more = f", the longest of {count}" if count > 1 else ""
         text = f"an outage of {gaps.max():.1f} s after {after:.1f} s{more}"
         yield Finding(topic, text, float(gaps.max()), car=samples[0].car)
@@ -65,20 +70,23 @@ def of_duplicates(samples: Sequence[Sample], topic: str) -> Iterator[Finding]:
 
 
 def of_repeats(samples: Sequence[Sample], topic: str) -> Iterator[Finding]:
-    """Yield that a topic with noise of its own repeats values under new stamps."""
-    if len(samples) < 2 * FEW or samples[0].role not in (Role.IMU, Role.TRUTH):
+    """Yield that a topic repeats each of its values as often under new stamps."""
+    values = [some for sample in samples if (some := _numbers(sample))]  # but frames without any marker
+    new = np.flatnonzero([one != other for one, other in pairwise(values)])
+    runs = np.diff(new)
+    if len(runs) < 2 * FEW or samples[0].role in MOVING:  # a speed may be a setpoint
         return
-    values = np.array([_numbers(sample) for sample in samples])
-    same = (np.diff(values, axis=0) == 0.0).all(axis=1)
-    alone = same & ~np.append(same[1:], False) & ~np.append(False, same[:-1])  # not of a stream that sticks
-    if alone.mean() > REPEATED:
-        text = f"{int(alone.sum())} of {len(samples)} messages are duplicates: they repeat the value of the one before"
-        yield Finding(topic, text, int(alone.sum()), car=samples[0].car)
+    if any((runs % n == 0).mean() > REPEATED for n in HELD):
+        count = len(values) - len(new) - 1
+        text = f"{count} of {len(samples)} messages are duplicates: they repeat the value of the one before"
+        yield Finding(topic, text, count, car=samples[0].car)
 
 
 def _numbers(sample: Sample) -> list[float]:
     if isinstance(sample.value, Twist) and sample.value.angular is not None:
         return [*sample.value.angular]
+    if isinstance(sample.value, Detections):
+        return [*sample.value.markers, *sample.value.bearings.ravel().tolist()]
     return [*sample.value.position] if isinstance(sample.value, CarPose) else [float(sample.stamp)] * 3
 
 

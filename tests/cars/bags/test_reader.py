@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
+import struct
 import sys
 import warnings
 from collections.abc import Iterator
@@ -22,7 +24,7 @@ from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.reader import ReaderError, in_reader
 from coopenv.cars.messages import codec
 from coopenv.cli.app import main
-from coopenv.sources.mcap_container import TooLargeError
+from coopenv.sources.mcap_container import Allowance, TooLargeError
 from tests.helpers import bags
 
 pytest.importorskip("rosbags", reason="needs the extra 'log'")
@@ -205,3 +207,16 @@ def test_compressed_frames_come_as_raw_ones(tmp_path: Path) -> None:
                 assert codec.stamp_of(found) == received
                 mode = cv2.IMREAD_COLOR if colours else cv2.IMREAD_GRAYSCALE
                 np.testing.assert_array_equal(frame_of(found, wanted), cv2.imdecode(good, mode))  # type: ignore[arg-type]
+
+
+def test_a_record_that_states_more_than_its_file_takes_no_memory() -> None:
+    """A length of 4 GB is that of a damaged file, which is read up to there."""
+    size = struct.pack("<I", 2**32 - 1)
+
+    class Few(io.BytesIO):
+        def read(self, amount: int | None = -1) -> bytes:
+            assert amount is not None and amount <= 64
+            return super().read(amount)
+
+    with pytest.raises(EOFError):
+        [*streams._ros1_records(Few(bytes(4) + size), Allowance(8), 8)]

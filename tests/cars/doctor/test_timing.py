@@ -72,6 +72,28 @@ def test_poses_that_repeat_under_new_stamps_are_duplicates() -> None:
     assert not [*of_repeats(samples(EVERY + 0.001, Role.TRUTH), "/pose")] and not [*of_repeats(samples(EVERY), "/imu")]
 
 
+def test_frames_that_a_camera_holds_are_duplicates() -> None:
+    """Of every rate; whole pixels of a slow car repeat themselves too, yet not as often each."""
+    rng, held = np.random.default_rng(0), []
+    for n in (2, 3):
+        ray = np.repeat(rng.normal(size=(300, 3)), n, axis=0)
+        held.append([replace(s, value=Detections((1,), r[None])) for s, r in zip(samples(EVERY), ray, strict=False)])
+    slow = np.repeat(rng.normal(size=(300, 3)), rng.integers(1, 6, 300), axis=0)
+    own = [replace(s, value=Detections((1,), r[None])) for s, r in zip(samples(EVERY), slow, strict=False)]
+    empty = [replace(s, value=Detections((), np.zeros((0, 3)))) for s in samples(EVERY)]
+    for some in held:
+        [found] = of_repeats([replace(s, role=Role.DETECTIONS) for s in some], "/camera")
+        assert "repeat the value of the one before" in found.text
+    assert not [f for some in (own, empty) for f in of_repeats([replace(s, role=Role.DETECTIONS) for s in some], "/c")]
+
+
+def test_half_of_the_turn_rates_lost_is_stated_and_a_tenth_is_not() -> None:
+    kept = np.random.default_rng(0).random(len(EVERY))
+    [found] = of_outages(samples(EVERY[kept > 0.7]), "/imu", 0, 20 * S)
+    assert "the longest of" in found.text and found.treatment is Treatment.USED
+    assert not [*of_outages(samples(EVERY[kept > 0.1]), "/imu", 0, 20 * S)]
+
+
 def test_a_delay_that_changes_is_stated() -> None:
     stamps = np.arange(1, 1000) * 10_000_000
     jitter = np.abs(np.random.default_rng(0).normal(0.0, 0.005 * S, len(stamps))).astype(np.int64)
