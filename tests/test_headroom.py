@@ -203,7 +203,7 @@ def test_cooperation_is_learnt_from_what_each_vehicle_observes(environment: str)
     assert unseen[2] > 0.8 * unseen[0]
 
 
-AHEAD = ("pilot", "two_pilots")
+AHEAD = ("pilot", "two_pilots", "relay")
 """Environments whose learned team is ahead of the rule `ENV_rule`, which reads the same, and of the planners."""
 
 
