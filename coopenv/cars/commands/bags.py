@@ -190,15 +190,19 @@ def calibrate(
     from coopenv.cars.calibration.calibrate import toml_text
     from coopenv.cars.calibration.drives import drive_of_recording, drive_of_streams
     from coopenv.cars.calibration.figure import residual_figure
+    from coopenv.cars.doctor.finding import Treatment
     from coopenv.runs.console import Progress
     from coopenv.sources.registry import kind_of
     from coopenv.sources.sources import open_recording
     from coopenv.viz.style import save
 
+    contradictions: list[str] = []
     with new_folder(out):
         check_file(out / "calibration.toml")
         if topics is not None:
             bag = open_bags(bags, options.parse_overrides(overrides), topics)
+            found = (f for f in bag.log.findings if f.treatment in (Treatment.REFUSED, Treatment.MENDED))
+            contradictions += [str(finding) for finding in found]
             drive = drive_of_streams(bag.streams, bag.where)
         elif overrides:
             raise CoopenvError("--override: needs the map of the bags' topics, --map topics.toml")
@@ -212,9 +216,10 @@ def calibrate(
     replace_text(files[0], toml_text(result))
     files += [save(residual_figure(result, c), out / f"residuals_{car.name}.png") for c, car in enumerate(drive.cars)]
     if as_json:
-        options.print_json({name: getattr(result, name) for name in ("rows", "findings", "notes", "noise")})
+        printed = {name: getattr(result, name) for name in ("rows", "findings", "notes", "noise")}
+        options.print_json({**printed, "contradictions": contradictions})
     else:
-        _print_calibrated(result, files)
+        _print_calibrated(result, files, contradictions)
     if not result.explained:
         raise typer.Exit(1)
 
@@ -244,14 +249,14 @@ def _survey(bags: Sequence[Path], like: str, folder: Path, truth: bool, as_json:
     console.print(f"Next: coopenv run {bags[0]} --map {result.files[1]}", soft_wrap=True)
 
 
-def _print_calibrated(result: Calibrated, files: Sequence[Path]) -> None:
+def _print_calibrated(result: Calibrated, files: Sequence[Path], contradictions: Sequence[str]) -> None:
     _print(result.rows)
     console = options.console()
     if any(car.lens is None for car in result.batch.cars):
         console.print("Bearings without pixels: intrinsics cannot be estimated.")
     if result.noise:
         console.print("Measured noise: " + ", ".join(f"{name} = {value:.3g}" for name, value in result.noise.items()))
-    for line in (*(result.findings or ("No constant is wrong.",)), *result.notes):
+    for line in (*((*result.findings, *contradictions) or ("No constant is wrong.",)), *result.notes):
         console.print(line, soft_wrap=True)
     console.print(f"Files: {', '.join(map(str, files))}", soft_wrap=True)
 

@@ -103,6 +103,9 @@ def test_a_refused_drive_runs_if_the_topic_is_trusted_and_the_title_names_it(
     short = ["--no-figures", "--steps", "2", "--out", str(tmp_path / "out"), "--observer", "dead_reckoning"]
     assert main(["run", path, *given, *short]) == 2
     assert "is 0 rad/s in all" in capsys.readouterr().err
+    main(["calibrate", path, *given, "--out", str(tmp_path / "calibration")])
+    printed = capsys.readouterr().out
+    assert f"{TWIST}: the turn rate of svea3 is 0 rad/s" in printed and "No constant is wrong" not in printed
     assert main(["run", path, *given, *short, "--trust", TWIST]) == 0
     assert f"(trusted: {TWIST})" in capsys.readouterr().out
     stated = load_map(tmp_path / "topics.toml").model_copy(update={"trust": ("all",)})
