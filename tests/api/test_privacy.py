@@ -40,8 +40,10 @@ EVERYTHING = {"observation.include": list(GROUPS)}
 
 def silent(name: str, observer: str, more: dict[str, Any] | None = None) -> Scenario:
     """An environment whose cameras and other sensors measure nothing, so that nothing depends on true poses."""
+    given = load_scenario(name)
     blind = {"topology.mode": "sensed", "camera.range": 1e-6, "observer.name": observer}
-    blind |= {"sensing": "blind"} if load_scenario(name).sensors else {}
+    blind |= {f"vehicles.{i}.camera.range": 1e-6 for i, vehicle in enumerate(given.vehicles) if vehicle.camera}
+    blind |= {"sensing": "blind"} if given.sensors else {}
     return load_scenario(name, {**EVERYTHING, **blind, **(more or {})})
 
 
