@@ -19,7 +19,7 @@ from coopenv.cars.bags.log import read_log
 from coopenv.cars.bags.topic_map import UNNEEDED, TopicMap, load_map
 from coopenv.cars.bags.topics import NS
 from coopenv.cars.doctor.finding import Finding, Treatment
-from coopenv.cars.doctor.streams import MOVING, TURNING, Streams
+from coopenv.cars.doctor.streams import TURNING, Streams
 from coopenv.cars.messages.readings import Sample
 from coopenv.cars.settings.profile import Role
 from coopenv.scenario import Scenario, load_scenario
@@ -34,7 +34,7 @@ LONGEST_GAP = 600.0  # s without any message that is needed
 
 OFF = 0.1
 """Share by which the rate of a camera may differ from the environment's without a warning."""
-SPARSE = 0.4  # share of the environment's samples of odometry that a car measures at least; half are common
+SPARSE = 0.4  # share of the environment's samples of odometry with turn rates at least; half are common
 
 ENDLESS = {
     "termination.arrival": False,
@@ -176,12 +176,13 @@ class Bag(TickGenerator):
         return scenario
 
     def _odd_rates(self) -> Iterator[str]:
+        topics, samples = self.log.streams.topics, self.scenario.rates.odometry
+        turning = {next((topics[car, r] for r in TURNING if (car, r) in topics), "") for car in self.binding.cars}
         for row in self.log.rows:
             if row.role in (Role.DETECTIONS, Role.BEARINGS) and row.rate and abs(row.rate / self._rate - 1.0) > OFF:
                 hint = f'set overrides = {{ "rates.camera" = {float(f"{row.rate:.3g}")} }} in the map'
                 yield f"{row.topic}: {row.rate:.1f} frames per second, the environment has {self._rate:g}: {hint}"
-            samples = self.scenario.rates.odometry
-            if row.role in (*MOVING, *TURNING) and row.rate and row.rate < SPARSE * samples:
+            if row.topic in turning and row.rate and row.rate < SPARSE * samples:
                 hint = f'set overrides = {{ "rates.odometry" = {float(f"{row.rate:.3g}")} }} in the map'
                 yield f"{row.topic}: {row.rate:.1f} messages per second, the environment has {samples:g}: {hint}"
 

@@ -201,7 +201,9 @@ def calibrate(
         check_file(out / "calibration.toml")
         if topics is not None:
             bag = open_bags(bags, options.parse_overrides(overrides), topics)
-            found = (f for f in bag.log.findings if f.treatment in (Treatment.REFUSED, Treatment.MENDED))
+            found = (
+                f for f in bag.log.findings if f.treatment in (Treatment.REFUSED, Treatment.MENDED, Treatment.TRUSTED)
+            )
             contradictions += [str(finding) for finding in found]
             drive = drive_of_streams(bag.streams, bag.where)
         elif overrides:

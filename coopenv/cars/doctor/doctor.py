@@ -94,8 +94,9 @@ def examine_cars(cars: Iterable[CarStreams], trusted: Collection[str] = ()) -> E
                 found.mends.append(mend)
             elif each.change is None:
                 found.spoilt.add(name)
-        others = (*_of_detections(car), *of_noise(found.cars[name]))
-        found.findings += [treated(finding, trusted) for finding in others]
+        named = {each.finding.subject for each in diagnoses}
+        noisy = (finding for finding in of_noise(car) if finding.subject not in named)
+        found.findings += [treated(finding, trusted) for finding in (*_of_detections(car), *noisy)]
     return found
 
 

@@ -369,8 +369,9 @@ def frozen(time: Array, values: NDArray[Any]) -> Iterator[tuple[float, float, in
             yield float(time[first]), float(time[last]), first
 
 
-FEWEST, NOISIER = 100, 3.0
-"""Samples at least; times its declared deviation from which on noise is a finding: information counts tenfold."""
+FEWEST, GRID, NOISIER = 100, 0.1, 3.0
+"""Different values at least, and their share, below which they are counts of an encoder, whose errors do not add up;
+times its declared deviation from which on noise is a finding: information counts tenfold."""
 BEND = 1.4826 / math.sqrt(6.0)
 """Deviation of white noise over the median size of its second differences."""
 
@@ -382,7 +383,7 @@ def of_noise(car: CarStreams) -> Iterator[Finding]:
         ("gyro", "turn rate", TURNING, "noise.angular_velocity"),
     ):
         time, values = car.tracks[f"{kind}_time"], car.tracks[kind].real
-        if len(time) < FEWEST or not car.noise[kind]:
+        if not car.noise[kind] or len(np.unique(values)) < max(FEWEST, GRID * len(time)):
             continue
         period = float(np.median(np.diff(time)))
         std = BEND * float(np.median(np.abs(np.diff(values, 2)))) * math.sqrt(period * car.odometry_rate)

@@ -177,13 +177,15 @@ def causes(car: CarStreams, every: bool = True) -> Iterator[Cause]:
 
 def _of_numbers(car: CarStreams) -> Iterator[Cause]:
     """Yield the assignment of marker numbers to landmarks in which bearings are least off, if it is another one."""
-    every, given = np.arange(len(car.places)), sight_of(car).target
-    toward = (sight_of(replace(car, target=np.full_like(car.target, n))).off_deg() for n in every)
-    off = [np.bincount(given, np.minimum(angles, LARGEST_DEG), len(every)) for angles in toward]
-    right = linear_sum_assignment(np.array(off).T * (1.0 - AS_GIVEN * np.eye(len(every))))[1]
-    moved = [n for n in np.flatnonzero(right != every).tolist() if n in given]
+    right, given = np.arange(len(car.places)), sight_of(car).target
+    toward = (sight_of(replace(car, target=np.full_like(car.target, n))).off_deg() for n in right)
+    off = np.array([np.bincount(given, np.minimum(angles, LARGEST_DEG), len(right)) for angles in toward]).T
+    seen = np.flatnonzero(np.bincount(given, minlength=len(right)) >= FEWEST)
+    right[seen] = linear_sum_assignment((off * (1.0 - AS_GIVEN * np.eye(len(right))))[seen])[1]
+    moved = [n for n in seen.tolist() if right[n] != n]
     if moved:
-        numbers = {int(right[n]): number for n, number in car.numbers.items() if n in given or right[n] == n}
+        others = {n: number for n, number in car.numbers.items() if n not in {*seen, *right[seen]}}
+        numbers = {**others, **{int(right[n]): number for n, number in car.numbers.items() if n in seen}}
         key = f"markers = {{ {', '.join(f'{car.names[k]} = {number}' for k, number in sorted(numbers.items()))} }}"
         names, places = ([car.names[n] for n in some] for some in (moved, right[moved]))
         text = f"markers {listed(names)} stand at {listed(places)}"
@@ -341,7 +343,7 @@ def of_sight(given: CarStreams) -> Iterator[Diagnosis]:
     ask = " (are heading, unit and frames.truth right?)"
     for cause in found or [_unexplained(given, sight) if lasts else Cause(topic, NO_CAUSE, _same)]:
         off = f"{sight.off_share():.0%} of the bearings are off by more than {OFF_DEG} deg{rest}"
-        text, treatment = f"{cause.text}: {off}", Treatment.REFUSED if found or cause.key else Treatment.USED
+        text, treatment = f"{cause.text}: {off}", Treatment.REFUSED if found or cause.subject == MAP else Treatment.USED
         if cause.subject == topic:
             off = f"{np.median(sight.off_deg()):.0f} deg off the bearings to landmarks (median)"
             text = f"motion capture of {car.name}, topic {topic}, is {_far(car, sight) or off}: {cause.text}{ask}"
@@ -351,14 +353,14 @@ def of_sight(given: CarStreams) -> Iterator[Diagnosis]:
             yield Diagnosis(about, cause.change if found else None, cause.parts)
 
 
-NO_CAUSE, MINOR = "no single cause explains it", 0.5
-"""Words of a misfit without a cause, and share of bearings that are off below which most of them are right."""
+MAP, NO_CAUSE, MINOR = "landmarks", "no single cause explains it", 0.5
+"""Subject of findings, words of a misfit without a cause, share of bearings that are off below which most fit."""
 
 
 def _unexplained(car: CarStreams, sight: PosedSightings) -> Cause:
-    """Return the streams that are to blame for a misfit without a cause; a key where the drive is refused.
+    """Return the streams that are to blame for a misfit without a cause.
 
-    If most bearings fit, it is detections; if wheels and gyro follow motion capture, it is no stream but the map.
+    If most bearings fit, it is detections; if wheels and gyro follow motion capture, it is the map or the camera.
     """
     assert car.truth_signals is not None
     if sight.off_share() < MINOR:
@@ -366,8 +368,8 @@ def _unexplained(car: CarStreams, sight: PosedSightings) -> Cause:
         return Cause(car.topic(CAMERAS), text, _same)
     turned, (moved, _) = turning_factor(car, car.truth_signals[1]), velocity_relations(car, *car.truth_signals)
     if turned is not None and moved is not None and max(abs(r.factor - 1.0) for r in (turned, moved)) < NAMED:
-        text = f"with motion capture, which wheels and gyro follow, bearings do not fit the map: {NO_CAUSE}"
-        return Cause("landmarks", text, _same, key="`coopenv calibrate --propose`, which solves a map")
+        text = f"wheels and gyro follow motion capture, and bearings do not fit (map, markers or camera?): {NO_CAUSE}"
+        return Cause(MAP, text, _same)
     return Cause(car.topic([Role.TRUTH]), NO_CAUSE, _same)
 
 

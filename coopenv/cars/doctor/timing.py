@@ -11,7 +11,7 @@ from coopenv.cars.bags.tracks import Track
 from coopenv.cars.doctor.doctor import Examined, treated
 from coopenv.cars.doctor.finding import Finding, Treatment
 from coopenv.cars.doctor.motion import IN_THE_ROOM, velocity_relations
-from coopenv.cars.doctor.streams import MOVING, TURNING
+from coopenv.cars.doctor.streams import MOVING
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist
 from coopenv.cars.settings.profile import Role
 
@@ -20,10 +20,10 @@ OUTAGE, PERIODS, OFTEN = 1.5, 20.0, 4.0
 """s, and periods of the topic, of a silence that is stated, and periods of one that may come more often."""
 FEW, SHARE = 5, 0.02
 """Messages, and their share, that come twice, above which that is stated."""
-REPEATED, HELD = 0.9, (2, 3, 4, 5, 6)
-"""Share of the runs of equal values with a multiple of a length above which a stream holds values, and lengths."""
-LOST = 0.25
-"""Share of the time in gaps of over three periods: half of the messages lost at random give 0.31, and 40 % 0.16."""
+REPEATED = 0.2
+"""Share of equal values in a row above which a stream repeats itself, of values with noise."""
+HELD, LENGTHS = 0.9, (2, 3, 4, 5, 6)
+"""Share of the runs of equal frames with a multiple of a length above which a camera holds them, and lengths."""
 LATE = 0.25
 """s by which a twentieth of the messages come later than the earliest: a network buffers them."""
 
@@ -39,11 +39,9 @@ def of_outages(samples: Sequence[Sample], topic: str, begin: int, end: int) -> I
     gaps = np.diff(stamps) * NS
     if samples[0].role in CAMERAS and (gaps > OFTEN * np.median(gaps)).sum() > FEW and all(map(_markers, samples)):
         return
-    wide = gaps > 3.0 * np.median(gaps)
-    lossy = samples[0].role in (*MOVING, *TURNING) and wide.sum() > FEW and gaps[wide].sum() > LOST * gaps.sum()
-    if lossy or gaps.max() > max(OUTAGE, PERIODS * float(np.median(gaps))):
+    if gaps.max() > max(OUTAGE, PERIODS * float(np.median(gaps))):
         after = (stamps[int(np.argmax(gaps))] - stamps[0]) * NS
-        count = int((wide if lossy else gaps > OUTAGE).sum())
+        count = int((gaps > OUTAGE).sum())
         more = f", the longest of {count}" if count > 1 else ""
         text = f"an outage of {gaps.max():.1f} s after {after:.1f} s{more}"
         yield Finding(topic, text, float(gaps.max()), car=samples[0].car)
@@ -70,14 +68,18 @@ def of_duplicates(samples: Sequence[Sample], topic: str) -> Iterator[Finding]:
 
 
 def of_repeats(samples: Sequence[Sample], topic: str) -> Iterator[Finding]:
-    """Yield that a topic repeats each of its values as often under new stamps."""
-    values = [some for sample in samples if (some := _numbers(sample))]  # but frames without any marker
-    new = np.flatnonzero([one != other for one, other in pairwise(values)])
-    runs = np.diff(new)
-    if len(runs) < 2 * FEW or samples[0].role in MOVING:  # a speed may be a setpoint
+    """Yield that a topic repeats values under new stamps: with noise of its own, or frames of a car that moves."""
+    if len(samples) < 2 * FEW or samples[0].role in MOVING:  # a speed may be a setpoint
         return
-    if any((runs % n == 0).mean() > REPEATED for n in HELD):
-        count = len(values) - len(new) - 1
+    values = [some for sample in samples if (some := _numbers(sample))]  # but frames without any marker
+    same = np.array([one == other for one, other in pairwise(values)], bool)
+    count, runs = int(same.sum()), np.diff(np.flatnonzero(~same))
+    if samples[0].role in CAMERAS:  # whole pixels of a slow car repeat themselves, too
+        repeats = len(runs) > 2 * FEW and any((runs % n == 0).mean() > HELD for n in LENGTHS)
+    else:
+        alone = same & ~np.append(same[1:], False) & ~np.append(False, same[:-1])  # not of a stream that sticks
+        count, repeats = int(alone.sum()), alone.mean() > REPEATED
+    if repeats:
         text = f"{count} of {len(samples)} messages are duplicates: they repeat the value of the one before"
         yield Finding(topic, text, count, car=samples[0].car)
 

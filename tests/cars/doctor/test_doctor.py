@@ -375,6 +375,34 @@ def test_the_map_of_another_room_is_to_blame_if_wheels_and_gyro_follow_motion_ca
     assert found.subject == "landmarks" and found.treatment is Treatment.REFUSED and "no single cause" in found.text
 
 
+def test_counts_of_an_encoder_and_a_gyro_of_a_wrong_scale_are_no_noise() -> None:
+    def counted(value: Any, _: float) -> Any:
+        if not isinstance(value, Twist) or value.linear is None:
+            return value
+        return replace(value, linear=np.round(10.0 * value.linear) / 10.0)
+
+    assert not [f for f in examine(streams_of(counted)).findings if "noise" in f.text]
+    assert not [f for f in examine(streams_of(twist(angular=0.02))).findings if "noise" in f.text]
+
+
+def test_a_number_that_is_read_by_mistake_moves_no_landmark() -> None:
+    """Marker 2 is never seen; five times its number is read from another one."""
+    swapped, few = FAULTS["markers exchanged"][0], iter(range(10**6))
+
+    def change(value: Any, t: float) -> Any:
+        value = swapped(value, t)
+        if not isinstance(value, Detections):
+            return value
+        kept = np.array(value.markers, int) != 2
+        markers, bearings = np.array(value.markers, int)[kept], value.bearings[kept]
+        if len(markers) and next(few) % 60 == 0:
+            markers[0] = 2
+        return Detections(tuple(markers.tolist()), bearings)
+
+    [found] = [f for f in examine(streams_of(change)).findings if f.subject == "markers"]
+    assert "SL1 and SL5 are exchanged" in found.text and "SL2 = 2" in found.key
+
+
 def test_ghosts_among_right_bearings_are_of_the_camera_and_not_of_motion_capture() -> None:
     rng = np.random.default_rng(0)
 

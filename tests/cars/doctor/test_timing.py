@@ -87,13 +87,6 @@ def test_frames_that_a_camera_holds_are_duplicates() -> None:
     assert not [f for some in (own, empty) for f in of_repeats([replace(s, role=Role.DETECTIONS) for s in some], "/c")]
 
 
-def test_half_of_the_turn_rates_lost_is_stated_and_a_tenth_is_not() -> None:
-    kept = np.random.default_rng(0).random(len(EVERY))
-    [found] = of_outages(samples(EVERY[kept > 0.7]), "/imu", 0, 20 * S)
-    assert "the longest of" in found.text and found.treatment is Treatment.USED
-    assert not [*of_outages(samples(EVERY[kept > 0.1]), "/imu", 0, 20 * S)]
-
-
 def test_a_delay_that_changes_is_stated() -> None:
     stamps = np.arange(1, 1000) * 10_000_000
     jitter = np.abs(np.random.default_rng(0).normal(0.0, 0.005 * S, len(stamps))).astype(np.int64)
