@@ -82,9 +82,7 @@ ARRAYS = {
     "landmarks": ArraySpec("KL3", VECTOR),
     "inbox_tick": ArraySpec("KNN", SENT, "i"),
     "due": ArraySpec("K", FLAG, "b"),
-    "pan": ArraySpec(
-        "KN", ANGLE, optional=0.0, present=lambda scenario: scenario is not None and scenario.action.pan is not None
-    ),
+    "pan": ArraySpec("KN", ANGLE, optional=0.0, present=lambda s: s is not None and s.action.pan is not None),
     "bearing_age": ArraySpec(
         "KN", AGE, optional=0.0, present=lambda s: s is not None and any(c.is_late for c in s.cameras)
     ),

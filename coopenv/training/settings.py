@@ -271,8 +271,10 @@ def read_settings(
 def continued_settings(path: Path, environment: str, **changes: Any) -> Settings:
     """Return the settings of a training that continues the agent of a file: its own ones.
 
-    Of a clone alone neither reward nor PPO were ever in use: it goes on as the arm `team` does. Raises CoopenvError: it
-    is a network over sets; or see `read_settings`.
+    Of a clone alone neither reward nor PPO were ever in use: it goes on as the arm `team` does.
+
+    Raises:
+        CoopenvError: it is a network over sets; or see `read_settings`.
     """
     begun = read_toml(path)
     if begun.get("network"):

@@ -174,7 +174,7 @@ def tensors_of(name: str, scenario: Scenario, clip: float) -> Arrays:
     """Return the tensors of a learned agent that a training with observations up to `clip` can continue.
 
     Raises:
-        CoopenvError: there is no such agent, it is another kind of driver, or it observes something else.
+        CoopenvError: there is no such agent, it is another kind of driver, or it observes otherwise.
     """
     agent, here = find_agent(name), layout_tables(observation_layout(scenario))
     if agent.folder is None or agent.network is None or not agent.network.observation:

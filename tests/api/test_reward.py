@@ -168,11 +168,7 @@ EXCEPTIONS = {
         "message_forward": "and goes the same way as the car",
     },
     "facade": {"map_in_view": "the nearest landmark stands beside the car, out of its camera's view"},
-    "large_crossing": {
-        "map_in_view": "the nearest landmarks stand beside the car, out of its camera's view",
-        "message_mask": "the car that arrives last is heard in 99 % of the steps",
-        "message_age": "and its message is new",
-    },
+    "large_crossing": {"map_in_view": "the nearest landmarks stand beside the car, out of its camera's view"},
     "urban_crossing": {"map_in_view": "the nearest landmarks stand beside the car, out of its camera's view"},
 }
 """Fields with an entry that hardly varies, and why it is there."""

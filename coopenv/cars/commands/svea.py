@@ -29,7 +29,8 @@ GateConnect = Annotated[
     ),
 ]
 OffBoard = Annotated[
-    bool, typer.Option("--off-board", help="Allow a router that is not on this computer, for trials beside a car.")
+    bool,
+    typer.Option("--off-board", help="Allow a router that is not on this computer, for trials beside a car."),
 ]
 Station = Annotated[
     str | None,
@@ -290,7 +291,8 @@ def see(
 @svea.command()
 def keys(
     deployment: Annotated[
-        Path | None, typer.Argument(metavar="[DEPLOYMENT.toml]", help="Deployment: keys for its cars and its station.")
+        Path | None,
+        typer.Argument(metavar="[DEPLOYMENT.toml]", help="Deployment: keys for its cars and its station."),
     ] = None,
     names: Annotated[str | None, typer.Option(help="Names instead, with commas between: svea7,svea8,station.")] = None,
     out: Annotated[

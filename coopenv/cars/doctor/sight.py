@@ -343,7 +343,8 @@ def of_sight(given: CarStreams) -> Iterator[Diagnosis]:
     ask = " (are heading, unit and frames.truth right?)"
     for cause in found or [_unexplained(given, sight) if lasts else Cause(topic, NO_CAUSE, _same)]:
         off = f"{sight.off_share():.0%} of the bearings are off by more than {OFF_DEG} deg{rest}"
-        text, treatment = f"{cause.text}: {off}", Treatment.REFUSED if found or cause.subject == MAP else Treatment.USED
+        text = f"{cause.text}: {off}"
+        treatment = Treatment.REFUSED if found or cause.subject == "landmarks" else Treatment.USED
         if cause.subject == topic:
             off = f"{np.median(sight.off_deg()):.0f} deg off the bearings to landmarks (median)"
             text = f"motion capture of {car.name}, topic {topic}, is {_far(car, sight) or off}: {cause.text}{ask}"
@@ -353,8 +354,8 @@ def of_sight(given: CarStreams) -> Iterator[Diagnosis]:
             yield Diagnosis(about, cause.change if found else None, cause.parts)
 
 
-MAP, NO_CAUSE, MINOR = "landmarks", "no single cause explains it", 0.5
-"""Subject of findings, words of a misfit without a cause, share of bearings that are off below which most fit."""
+NO_CAUSE, MINOR = "no single cause explains it", 0.5
+"""Words of a misfit without a cause, and share of bearings that are off below which most of them fit."""
 
 
 def _unexplained(car: CarStreams, sight: PosedSightings) -> Cause:
@@ -369,7 +370,7 @@ def _unexplained(car: CarStreams, sight: PosedSightings) -> Cause:
     turned, (moved, _) = turning_factor(car, car.truth_signals[1]), velocity_relations(car, *car.truth_signals)
     if turned is not None and moved is not None and max(abs(r.factor - 1.0) for r in (turned, moved)) < NAMED:
         text = f"wheels and gyro follow motion capture, and bearings do not fit (map, markers or camera?): {NO_CAUSE}"
-        return Cause(MAP, text, _same)
+        return Cause("landmarks", text, _same)
     return Cause(car.topic([Role.TRUTH]), NO_CAUSE, _same)
 
 

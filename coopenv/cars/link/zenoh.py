@@ -14,7 +14,16 @@ from weakref import WeakSet
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, needing
 from coopenv.cars.link.clock import CLOCK
-from coopenv.cars.link.transport import SECURE, UNIX, Arrival, Callback, LinkError, Tls, address_of, first_trouble
+from coopenv.cars.link.transport import (
+    SECURE,
+    UNIX,
+    Arrival,
+    Callback,
+    LinkError,
+    Tls,
+    address_of,
+    first_trouble,
+)
 from coopenv.cars.settings.profile import Way
 
 LEASE = 1000  # ms after which a process that has frozen no longer counts as present
