@@ -17,6 +17,7 @@ from coopenv.base.errors import AgentWarning, CoopenvError
 from coopenv.policies.alone import Alone
 from coopenv.policies.loader import NetworkCard, NetworkColumn
 from coopenv.policies.look_ahead import LookAhead
+from coopenv.policies.memory import MEMORY, PARTS, Memory
 from coopenv.scenario import Scenario
 
 ENTRY = f"{__name__}:Network"
@@ -111,7 +112,12 @@ class Network:
         self._clip = np.float32(network.clip)
         tensors = load_weights(path, network.sha256)
         tensors = {name: values for name, values in tensors.items() if not name.startswith(CRITIC)}
-        depth = _depth_of(path, tensors, len(self._columns), len(action))
+        self._memory, width = None, 0
+        if f"{MEMORY}{PARTS[0]}" in tensors:
+            remembered = {name: tensors.pop(name) for name in [*tensors] if name.startswith(MEMORY)}
+            width = _width_of(path, remembered, len(self._columns))
+            self._memory = Memory(remembered)
+        depth = _depth_of(path, tensors, len(self._columns), width, len(action))
         self._mean, self._std = tensors["observation.mean"], tensors["observation.std"]
         self._layers = [(tensors[f"layers.{i}.weight"].T.copy(), tensors[f"layers.{i}.bias"]) for i in range(depth)]
         self._name, self._seen, self._rows = folder.resolve().name, dict(network.seen), 0
@@ -124,8 +130,8 @@ class Network:
 
     def reset(self, mask: np.ndarray) -> None:
         """Begin new episodes in the rows of a mask."""
-        for rule in self._rules:
-            rule.reset(mask)
+        for part in (*self._rules, *([self._memory] if self._memory else [])):
+            part.reset(mask)
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return the actions, (rows, A) in [-1, 1], for flat observations, (rows, D)."""
@@ -134,6 +140,7 @@ class Network:
             self._compare_with_training(seen[seen.any(axis=1)])
         scaled = (seen[:, self._columns] - self._mean) / self._std
         values = np.clip(scaled, -self._clip, self._clip).astype(np.float32)
+        values = self._memory(values) if self._memory else values
         for weight, bias in self._layers[:-1]:
             values = np.tanh(values @ weight + bias)
         weight, bias = self._layers[-1]
@@ -192,14 +199,23 @@ def load_weights(path: Path, digest: str) -> dict[str, np.ndarray]:
     return tensors
 
 
-def _depth_of(path: Path, tensors: Mapping[str, np.ndarray], inputs: int, outputs: int) -> int:
+def _width_of(path: Path, tensors: Mapping[str, np.ndarray], inputs: int) -> int:
+    """Return the width of a memory. Raises CoopenvError: the weights are not those of one."""
+    width = tensors[f"{MEMORY}{PARTS[0]}"].shape[0] // 3
+    shapes = zip(PARTS, ((3 * width, inputs), (3 * width, width), (3 * width,), (3 * width,)), strict=True)
+    if {name: values.shape for name, values in tensors.items()} != {f"{MEMORY}{part}": shape for part, shape in shapes}:
+        raise CoopenvError(f"{path}: the shapes of {MEMORY}* do not fit {inputs} observations")
+    return width
+
+
+def _depth_of(path: Path, tensors: Mapping[str, np.ndarray], inputs: int, remembered: int, outputs: int) -> int:
     """Return the number of layers. Raises CoopenvError: the weights are not those of a policy of such a width."""
     names = {"observation.mean", "observation.std", "log_std"}
     depth = (len(tensors) - len(names)) // 2
     expected = names | {f"layers.{i}.{part}" for i in range(depth) for part in ("weight", "bias")}
     if set(tensors) != expected or depth < 1:
         raise CoopenvError(f"{path}: not the weights of a policy: {', '.join(sorted(set(tensors) ^ expected))[:80]}")
-    widths = [inputs, *(tensors[f"layers.{i}.bias"].size for i in range(depth - 1)), outputs]
+    widths = [inputs + remembered, *(tensors[f"layers.{i}.bias"].size for i in range(depth - 1)), outputs]
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("observation.mean", "observation.std"), (inputs,))
     for i, (before, after) in enumerate(pairwise(widths)):
         shapes |= {f"layers.{i}.weight": (after, before), f"layers.{i}.bias": (after,)}

@@ -199,7 +199,7 @@ def train(
             trainer.begin(report.cloning)
             if plan.settings.steps and (plan.settings.clone or plan.settings.start):
                 first = "clone" if plan.settings.clone else "start"
-                course.drivers[first] = figures_of(judge(trainer.mean_action, first, seeds))
+                course.drivers[first] = figures_of(judge(trainer.driver(), first, seeds))
         try:
             _learn(trainer, course, report, judge, partial(save, path, trainer, course, onnx, logs))
             if course.best:
@@ -218,10 +218,8 @@ def train(
 
 def _finished(trainer: Trainer) -> Policy:
     """Return the driver that the agent is: the policy, and in its place the driver of those who are alone."""
-    if trainer.plan.settings.alone is None:
-        return trainer.mean_action
-    alone = Alone(trainer.scenario, trainer.plan.settings.alone)
-    return lambda observations: alone(observations, trainer.mean_action(observations))
+    alone = trainer.plan.settings.alone
+    return trainer.driver(*([Alone(trainer.scenario, alone)] if alone is not None else []))
 
 
 def _ranking(out: Path, course: Course, results: list[Result], notes: Iterable[str]) -> Ranking:
@@ -265,7 +263,7 @@ def _learn(trainer: Trainer, course: Course, report: Reports, judge: Judge, keep
 
     def look() -> None:
         status = trainer.status
-        means = figures_of(judge(trainer.mean_action, f"{status.steps:,} steps", seeds))
+        means = figures_of(judge(trainer.driver(), f"{status.steps:,} steps", seeds))
         trainer.record(means)
         course.curve.append({"steps": status.steps, "seconds": round(status.seconds, 1), **means})
         if evaluation.keep == "last" or course.best_row is course.curve[-1]:
@@ -394,6 +392,8 @@ def restore(checkpoint: Checkpoint, trainer: Trainer) -> None:
         trainer.seconds, trainer.cpu_seconds = checkpoint.progress["seconds"], checkpoint.progress["cpu_seconds"]
         trainer.model.critic_alone = bool(checkpoint.progress["critic_alone"])
         if "world" in arrays:
+            if trainer.remembering:
+                trainer.remembering.go_on_from(arrays["statistics"]["memory"])
             trainer.env.go_on_from(trainer.batch.set_state(arrays["world"]))
         else:
             trainer.batch.seed(trainer.plan.seed + trainer.model.num_timesteps)
@@ -407,7 +407,10 @@ def _arrays(trainer: Trainer) -> Arrays:
     groups: dict[str, Mapping[str, Any]] = {
         "policy": trainer.tensors(),
         "optimiser": {f"{index}/{name}": values.numpy() for index, row in moments for name, values in row.items()},
-        "statistics": {"returns": trainer.env.returns},
+        "statistics": {
+            "returns": trainer.env.returns,
+            **({"memory": trainer.remembering.state.numpy()} if trainer.remembering else {}),
+        },
         "random": {"torch": torch.get_rng_state().numpy(), "numpy": np.append(key, np.uint32(position))},
         "world": _worlds(trainer),
     }

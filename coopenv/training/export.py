@@ -181,6 +181,8 @@ def check_onnx(settings: Settings) -> None:
     """
     if settings.network:
         raise CoopenvError(f"--onnx: not with network = '{settings.network}'")
+    if settings.ppo.memory:
+        raise CoopenvError("--onnx: not with ppo.memory, a model has no state")
     with needing(f"--onnx needs the package onnx: {install_command('onnx')}"):
         import_module("onnx")
 

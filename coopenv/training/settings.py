@@ -77,6 +77,9 @@ class Ppo(Section):
     """Initial standard deviation of the exploration; actions reach from -1 to 1."""
     hidden: tuple[Count, ...] = Field(default=(128, 128), min_length=1)
     """Widths of the hidden layers (tanh) of policy and value."""
+    memory: Count | None = None
+    """Width of a memory, a gated recurrent unit, that policy and value read beside the observation; it is learnt along
+    whole rollouts. A clone begins without it."""
     observation_clip: Positive = 6.0
     """Bound of observations after normalisation by running mean and standard deviation."""
 
@@ -169,6 +172,8 @@ class Settings(Section):
             raise ValueError("steps: 0 is for a clone alone, nothing is learnt without [clone]")
         if self.start is not None and self.clone is not None:
             raise ValueError("start: a training begins as an agent or as a [clone], give one of them")
+        if self.steps == 0 and self.ppo.memory:
+            raise ValueError("ppo.memory: a clone alone has none, set steps")
         if self.network and self.alone is not None:
             raise ValueError(f"alone: not with network = '{self.network}'")
         if sum(variation.share for variation in self.variations) > 1.0:

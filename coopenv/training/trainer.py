@@ -19,10 +19,13 @@ from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv, Lea
 from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.base.errors import CoopenvError
 from coopenv.policies import decide, find_agent, load_agent, restart
+from coopenv.policies.alone import Alone
+from coopenv.policies.memory import MEMORY, PARTS, Memory
 from coopenv.policies.network import CRITIC, RightOfWay, layout_tables, load_weights
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import SETTLED_FROM
 from coopenv.training.batches import APART, LEAST_VARIANCE, Arrays, MixedWorlds, NormalisedEnv
+from coopenv.training.memory import RememberingEnv, RememberingPolicy, RememberingPpo, SequencesBuffer
 from coopenv.training.settings import Clone, TrainingPlan
 
 
@@ -198,9 +201,6 @@ class DivergedError(CoopenvError):
 class Trainer:
     """A policy that all vehicles share, and everything that its next update depends on."""
 
-    algorithm: Any = LeanPpo
-    policy: Any = TanhPolicy
-
     def __init__(self, plan: TrainingPlan, scenario: Scenario, threads: int | None = None) -> None:
         """Build worlds and networks.
 
@@ -225,9 +225,16 @@ class Trainer:
         self.gamma = ppo.discount(scenario)
         """Discount per decision."""
         widths = list(ppo.hidden)
-        self.model = self.algorithm(
-            self.policy,
-            self.env,
+        self.remembering = RememberingEnv(self.env, ppo.memory) if ppo.memory else None
+        kinds = (
+            (RememberingPpo, RememberingPolicy, SequencesBuffer)
+            if ppo.memory
+            else (LeanPpo, TanhPolicy, ActingRowsBuffer)
+        )
+        algorithm, policy, buffer = kinds
+        self.model: LeanPpo = algorithm(
+            policy,
+            self.remembering or self.env,
             learning_rate=lambda _: ppo.learning_rate * (1.0 - self._share),
             n_steps=ppo.decisions,
             batch_size=max(2, self._rollout // ppo.minibatches),
@@ -238,16 +245,19 @@ class Trainer:
             ent_coef=ppo.entropy,
             vf_coef=ppo.value_weight,
             max_grad_norm=ppo.max_gradient,
-            rollout_buffer_class=ActingRowsBuffer,
+            rollout_buffer_class=buffer,
             rollout_buffer_kwargs={"rows": self.batch},
             policy_kwargs={
                 "net_arch": {"pi": widths, "vf": widths},
                 "log_std_init": math.log(ppo.initial_std),
                 "optimizer_kwargs": {"eps": 1e-5, "fused": True},
+                **({"memory": ppo.memory} if ppo.memory else {}),
             },
             seed=plan.seed,
             device="cpu",
         )
+        if self.remembering:
+            self.remembering.cell = self.model.policy.cell
         self.model.set_logger(Logger(None, []))
         self.env.settled = plan.settings.start is not None or plan.settings.clone is not None
         self.model.critic_alone = self.env.settled and ppo.critic_first > 0.0
@@ -286,7 +296,7 @@ class Trainer:
             if part == 0:
                 env.statistics.update(raw)
                 env.spread.update(returns)
-            observations = torch.from_numpy(env.normalise(raw))
+            observations = torch.from_numpy(self.forgetting(env.normalise(raw)))
             values = (env.reward_scale * returns)[:, None]
             targets = [torch.from_numpy(aims.astype(np.float32)) for aims in (actions, values)]
             slopes = partial(self._differentiate, observations, targets)
@@ -297,7 +307,7 @@ class Trainer:
     def _watched(self, clone: Clone, part: int, report: Callable[[str], None]) -> Iterator[tuple[np.ndarray, ...]]:
         """Yield what `watch` returns in the worlds of a round, by scenario."""
         all_worlds, threads = sum(count for _, count in self._scenarios), self.batch.engine.world.threads
-        driving = self.mean_action if part else None
+        driving = self.driver() if part else None
         for place, (each, count) in enumerate(self._scenarios, part * len(self._scenarios)):
             worlds, start = max(1, clone.episodes * count // all_worlds // clone.rounds), self.plan.seed + APART * place
             rule = RightOfWay(each) if self.rule else None
@@ -323,7 +333,7 @@ class Trainer:
         self._share = self._spent()
         ahead = max(self._spent(self._rollout), self.seconds / (60.0 * (self.plan.settings.minutes or math.inf)))
         self.model.critic_alone = self.model.critic_alone and ahead <= LONGEST_ALONE
-        with self._finite():
+        with self.finite():
             self.model.learn(self._rollout, callback=self._watch, reset_num_timesteps=False)
         if self.model.critic_alone:
             self.model.critic_alone = self.model.explained < self.plan.settings.ppo.critic_first
@@ -331,18 +341,16 @@ class Trainer:
         self.cpu_seconds += process_time() - cpu_begin
         return self.status
 
-    def mean_action(self, observations: np.ndarray) -> np.ndarray:
-        """Return the policy's actions without exploration, (rows, A), where it observes (rows, D).
+    def driver(self, *further: Alone) -> "MeanAction":
+        """Return the policy as it is now, without exploration, under the rule of the training and further ones."""
+        return MeanAction(self, *further)
 
-        Raises:
-            DivergedError: it is not finite.
-        """
-        with self._finite():
-            actions = np.asarray(self.model.predict(self.env.normalise(observations), deterministic=True)[0])
-        return self.rule(observations, actions) if self.rule else actions
+    def forgetting(self, seen: np.ndarray) -> np.ndarray:
+        """Return normalised observations beside an empty memory, where the policy has one."""
+        return np.pad(seen, ((0, 0), (0, self.plan.settings.ppo.memory or 0)))
 
     @contextmanager
-    def _finite(self) -> Iterator[None]:
+    def finite(self) -> Iterator[None]:
         """Raise an error of one line for a policy that is not finite, which torch notices only as it draws actions."""
         try:
             yield
@@ -399,6 +407,8 @@ class Trainer:
         networks = zip(("", CRITIC), self.model.policy.layers(), strict=True)
         each = [(f"{prefix}layers.{i}", layer) for prefix, layers in networks for i, layer in enumerate(layers)]
         found = {f"{name}.{part}": getattr(layer, part) for name, layer in each for part in ("weight", "bias")}
+        if self.remembering:
+            found |= {f"{MEMORY}{part}": getattr(self.remembering.cell, part) for part in PARTS}
         return {**found, "log_std": self.model.policy.log_std}
 
     def record(self, figures: dict[str, float]) -> None:
@@ -411,3 +421,32 @@ class Trainer:
         """End the threads and the log."""
         self.model.logger.close()
         self.env.close()
+
+
+class MeanAction:
+    """The mean action of a trainer's policy, under rules as in a `Network`."""
+
+    def __init__(self, trainer: Trainer, *further: Alone) -> None:
+        """Take the policy, and rules beside that of the training."""
+        self._trainer, self._rules = trainer, [*([trainer.rule] if trainer.rule else []), *further]
+        self._memory = Memory(trainer.tensors()) if trainer.remembering else None
+
+    def reset(self, mask: np.ndarray) -> None:
+        """Begin new episodes in the rows of a mask (rows,), bool."""
+        for part in (*self._rules, *([self._memory] if self._memory else [])):
+            part.reset(mask)
+
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        """Return actions without exploration, (rows, A), where vehicles observe (rows, D).
+
+        Raises:
+            DivergedError: they are not finite.
+        """
+        trainer = self._trainer
+        seen = trainer.env.normalise(observations)
+        with trainer.finite():
+            remembered = self._memory(seen) if self._memory else seen
+            actions = np.asarray(trainer.model.predict(remembered, deterministic=True)[0])
+        for rule in self._rules:
+            actions = rule(observations, actions)
+        return actions

@@ -129,13 +129,13 @@ def test_a_rule_limits_the_speeds_of_training_and_agent(tmp_path: Path) -> None:
     free = np.asarray(trainer.model.predict(trainer.env.normalise(rows), deterministic=True)[0])
     full = np.tile(np.float32([1.0, 0.0]), (16, 1))
     rule = RightOfWay(trainer.scenario)
-    assert trainer.mean_action(rows) == pytest.approx(rule(rows, free))
+    assert trainer.driver()(rows) == pytest.approx(rule(rows, free))
     limits = rule(rows, full)[:, 0]
     trainer.env.step_async(full)
     assert np.array_equal(trainer.batch._actions[:, 0], limits)
     export(tmp_path, tmp_path, trainer, environment_file("open_square"), [], [])
     agent = load_agent(tmp_path, trainer.scenario)
-    assert agent(rows) == pytest.approx(trainer.mean_action(rows), abs=1e-5)
+    assert agent(rows) == pytest.approx(trainer.driver()(rows), abs=1e-5)
     assert agent.agents == list(trainer.scenario.vehicle_names)
 
 
@@ -201,7 +201,7 @@ def test_a_policy_that_is_not_finite_is_one_error_line(broken: str) -> None:
         else:
             policy.log_std[:] = -1e9  # finite, but it draws nothing
     with pytest.raises(coopenv.CoopenvError, match=r"diverged: after 0 steps .* ppo\.learning_rate = 0\.001"):
-        trainer.mean_action(np.zeros((1, 132), dtype=np.float32))
+        trainer.driver()(np.zeros((1, 132), dtype=np.float32))
 
 
 def figures_of(policy: Policy, scenario: Scenario) -> dict[str, Result]:
@@ -265,16 +265,14 @@ def test_an_agent_of_a_longer_action_is_not_this_one(trained: Trainer, tmp_path:
         load_agent(tmp_path, trained.scenario)
 
 
-def test_the_judged_driver_is_the_one_that_the_agent_is() -> None:
+@pytest.mark.parametrize(("alone", "drives"), [(None, False), ("constant_speed", True)])
+def test_the_judged_driver_is_the_one_that_the_agent_is(alone: str | None, drives: bool) -> None:
     """Where a vehicle receives no message, it is that of the key `alone`."""
     scenario = coopenv.load_scenario("lighthouse")
-
-    def mean_action(observations: np.ndarray) -> np.ndarray:
-        return np.full((len(observations), 2), -1.0)
-
-    for alone, drives in ((None, False), ("constant_speed", True)):
-        plan = SimpleNamespace(settings=SimpleNamespace(alone=alone))
-        driver = _finished(SimpleNamespace(plan=plan, scenario=scenario, mean_action=mean_action))
-        seen = np.zeros((2, observation_layout(scenario).size), dtype=np.float32)
-        actions = [driver(seen) for _ in range(round(scenario.rates.decision) + 1)]
-        assert (actions[0] == -1.0).all() and (actions[-1] != -1.0).any() == drives
+    trainer = Trainer(TrainingPlan("lighthouse", Settings(ppo=SMALL, alone=alone), seed=0), scenario, threads=1)
+    for layers in trainer.model.policy.layers():
+        torch.nn.init.zeros_(layers[-1].weight), torch.nn.init.constant_(layers[-1].bias, -2.0)
+    driver = _finished(trainer)
+    seen = np.zeros((2, observation_layout(scenario).size), dtype=np.float32)
+    actions = [driver(seen) for _ in range(round(scenario.rates.decision) + 1)]
+    assert (actions[0] == -1.0).all() and (actions[-1] != -1.0).any() == drives

@@ -8,7 +8,7 @@ NumPy's, and on AMD matrices are multiplied by oneDNN.
 import copy
 import math
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -264,10 +264,15 @@ class ActingRowsBuffer(RolloutBuffer):
             for name in ("observations", "actions", "values", "log_probs", "advantages", "returns"):
                 setattr(self, name, self.swap_and_flatten(getattr(self, name)))
             self.generator_ready = True
+        for part in self.parts(batch_size or max(1, int(self.acted.sum()))):
+            yield self._get_samples(part)
+
+    def parts(self, batch_size: int) -> Iterator[np.ndarray]:
+        """Yield the numbers of the rows of each minibatch."""
         chosen = np.random.permutation(np.flatnonzero(self.swap_and_flatten(self.acted)))
-        for part in np.array_split(chosen, max(1, round(len(chosen) / (batch_size or max(1, len(chosen)))))):
+        for part in np.array_split(chosen, max(1, round(len(chosen) / batch_size))):
             if len(part):
-                yield self._get_samples(part)
+                yield part
 
 
 ONEDNN: Any = getattr(torch.ops.mkldnn, "_linear_pointwise", None)  # private to torch
@@ -304,18 +309,20 @@ def outputs(layers: Sequence[nn.Linear], rows: Tensor) -> list[Tensor]:
     return found
 
 
-def differentiate(layers: Sequence[nn.Linear], found: Sequence[Tensor], slope: Tensor) -> None:
+def differentiate(layers: Sequence[nn.Linear], found: Sequence[Tensor], slope: Tensor, through: bool = False) -> Tensor:
     """Write a loss's derivatives with respect to the parameters of a tanh network into their `grad`.
 
     Args:
         layers: of the network.
         found: the result of `outputs`.
         slope: derivative of the loss with respect to the network's output, (rows, A).
+        through: also return the derivative with respect to the network's input, (rows, D).
     """
     for layer, inputs in zip(reversed(layers), reversed(found[:-1]), strict=True):
         layer.weight.grad, layer.bias.grad = product(slope.t(), inputs.t()), slope.sum(0)
         if layer is not layers[0]:
             slope = torch.ops.aten.tanh_backward(product(slope, layer.weight.t()), inputs)
+    return product(slope, layers[0].weight.t()) if through else slope
 
 
 class TanhPolicy(ActorCriticPolicy):
@@ -354,6 +361,11 @@ class LeanPpo(PPO):
     """Whether the critic alone learns, and the policy stays as it is."""
     explained = 0.0
     """Share of the variance of the last rollout's returns that the critic explained, over rows that acted."""
+    passes_back = False
+    """Whether the loss's derivatives with respect to the networks' inputs are of use."""
+
+    def pass_back(self, slopes: list[Tensor]) -> None:
+        """Take the derivatives with respect to the inputs (rows, D) of each network that learns."""
 
     @torch.no_grad()
     def train(self) -> None:
@@ -389,12 +401,15 @@ class LeanPpo(PPO):
         free = torch.where(advantages > 0.0, ratio <= 1.0 + clip, ratio >= 1.0 - clip)
         slope = (free * advantages * ratio).div_(-count).unsqueeze(1)  # with respect to the logarithm of the density
         policy.optimizer.zero_grad()
+        slopes = list[Tensor]()
         if not self.critic_alone:
-            differentiate(actor, found, slope * deviation * precision)
+            slopes.append(differentiate(actor, found, slope * deviation * precision, self.passes_back))
             policy.log_std.grad = (slope * (deviation**2 - 1.0)).sum(0).sub_(self.ent_coef)
         found = outputs(critic, rows.observations)
         excess = found[-1].squeeze(1) - rows.returns
-        differentiate(critic, found, excess.mul(2.0 * self.vf_coef / count).unsqueeze(1))
+        weighted = excess.mul(2.0 * self.vf_coef / count).unsqueeze(1)
+        slopes.append(differentiate(critic, found, weighted, self.passes_back))
+        self.pass_back(slopes)
         figures = {
             "policy_gradient_loss": -float(gain.mean()),
             "value_loss": float(excess.square().mean()),
