@@ -22,6 +22,7 @@ from benchmarl.algorithms import MappoConfig
 from benchmarl.experiment import Callback, Experiment, ExperimentConfig
 from benchmarl.models.mlp import MlpConfig
 from benchmarl_task import CooperativeTask
+from plain_infos import PlainInfos
 from rich.console import Console
 from torchrl.envs import EnvBase
 from torchrl.envs.libs.pettingzoo import PettingZooWrapper
@@ -29,7 +30,6 @@ from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 from benchmarks.machine import machine
 from benchmarks.training import mean_and_error
 from coopenv.api.make import parallel_env
-from coopenv.api.parallel_env import PlainInfos
 from coopenv.report.table import Table
 
 ITERATIONS = 6

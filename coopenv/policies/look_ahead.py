@@ -56,7 +56,7 @@ class _Sight(NamedTuple):
     view: FieldOfView
 
 
-class _Follower(NamedTuple):
+class Follower(NamedTuple):
     """Another vehicle that may measure the planning one; it is predicted to drive straight on along its route.
 
     An entry for each of F rows of planning vehicles.
@@ -170,7 +170,7 @@ class LookAhead(RouteFollower):
         turns = offset != 0.0
         return np.where(turns, self.pursue(aside), along), np.where((blocked & turns)[:, None, None], leg, points)
 
-    def followers(self, observations: np.ndarray, due: np.ndarray) -> list[_Follower]:
+    def followers(self, observations: np.ndarray, due: np.ndarray) -> list[Follower]:
         """Return the vehicles whose losses count for the rows `due` of the observations; here none."""
         return []
 
@@ -178,7 +178,7 @@ class LookAhead(RouteFollower):
         """Return flags (rows, M) of the senders that plans keep away from: all to which the vehicle gives way."""
         return self.before(senders, vehicle)
 
-    def costs(self, observations: np.ndarray, vehicle: np.ndarray, followers: list[_Follower]) -> np.ndarray:
+    def costs(self, observations: np.ndarray, vehicle: np.ndarray, followers: list[Follower]) -> np.ndarray:
         """Return the costs, (rows, plans) in s, for rows that are of these vehicles, (rows,)."""
         (pieces, bends), sight = self._route_pieces(observations), self._sight(observations, vehicle)
         axes, std = (10.0 ** self.read(observations, name).astype(float) for name in ("axis_std", "heading_std"))
@@ -188,7 +188,7 @@ class LookAhead(RouteFollower):
         zero = np.zeros((len(observations), len(offsets)), dtype=np.float32)
         now = _Path(zero, zero, zero, zero, np.repeat(self.read(observations, "route_offset"), zero.shape[1], axis=1))
         (mask, others, forward), keep = self.received(observations), self.distance_to_keep(observations)[:, None]
-        senders = _senders(vehicle, self.reported(observations)[0].shape[1]) % len(self._top)
+        senders = senders_in_slots(vehicle, self.reported(observations)[0].shape[1]) % len(self._top)
         theirs = self._top[by_place(senders, mask.shape[1])][..., None]
         followers = [each._replace(covariance=_repeated(each.covariance, zero.shape[1])) for each in followers]
         avoided, others = self.avoided(mask, vehicle), others + self.body_center * forward
@@ -254,7 +254,7 @@ class LookAhead(RouteFollower):
         odds = odds * unhidden(sight.boxes, odds > LEAST_ODDS, camera, sight.landmarks, self.cruise * time)
         return covariance.measured(line, self.bearing_variance(line, radial, lateral), odds)
 
-    def follow(self, follower: _Follower, time: float, place: np.ndarray, covariance: PlanarCovariance) -> _Follower:
+    def follow(self, follower: Follower, time: float, place: np.ndarray, covariance: PlanarCovariance) -> Follower:
         """Return a follower a step later, after the bearings to this vehicle that it can be expected to have.
 
         Args:
@@ -296,56 +296,7 @@ def _square(line: np.ndarray) -> np.ndarray:
     return np.asarray(np.maximum(line[..., 0] ** 2 + line[..., 1] ** 2, 0.01))
 
 
-def _senders(vehicle: np.ndarray, slots: int) -> np.ndarray:
+def senders_in_slots(vehicle: np.ndarray, slots: int) -> np.ndarray:
     """Return the vehicle whose message is in each slot, (rows, slots): all but the receiver, in order."""
     slot = np.arange(slots)
     return np.asarray(slot + (slot >= vehicle[:, None]))
-
-
-class TeamLookAhead(LookAhead):
-    """The planner for the fleet: plans also have a pace, and a cost for the losses of other vehicles.
-
-    For every vehicle that may measure the planning one, the covariance of that vehicle is predicted, with the bearings
-    to the planning vehicle as the only ones; its uncertainty costs as much as the own. It plans with the covariances of
-    all vehicles, which no vehicle has by itself: a reference for cooperation, which needs the rows of the whole fleet.
-    """
-
-    needs = (*LookAhead.needs, "position_std", "message_position", "route_left")
-    clearance = np.inf  # others do not expect a vehicle to slow down or turn aside for them
-    plan_paces = (1.0, 0.75, 0.5, 0.25)
-
-    def __init__(self, scenario: Scenario) -> None:
-        """See `Driver`."""
-        super().__init__(scenario)
-        fleet, landmarks = range(len(scenario.vehicles)), len(scenario.landmarks)
-        self._measures = np.array([[landmarks + vehicle in row for vehicle in fleet] for row in self._neighbours])
-        self._radius = np.array([vehicle.goal_radius for vehicle in scenario.vehicles])
-
-    def avoided(self, senders: np.ndarray, vehicle: np.ndarray) -> np.ndarray:
-        """See `LookAhead.avoided`: here all, for the reason for which `clearance` has no bound."""
-        return senders
-
-    def followers(self, observations: np.ndarray, due: np.ndarray) -> list[_Follower]:
-        """See `LookAhead.followers`.
-
-        Raises:
-            ValueError: there are not the rows of all vehicles.
-        """
-        count = len(self._top)
-        if len(observations) % count:
-            raise ValueError(f"it plans for all vehicles: rows: {len(observations)}, allowed: multiples of {count}")
-        mask, place, forward = (part[due] for part in self.reported(observations))
-        axes, std = (10.0 ** self.read(observations, name).astype(float) for name in ("axis_std", "heading_std"))
-        heading, left = (self.read(observations, name)[:, 0] for name in ("route_heading", "route_left"))
-        found, own = [], due % count
-        for slot, vehicle in enumerate(_senders(own, mask.shape[1]).T):
-            other = due - own + vehicle
-            counts = self._measures[vehicle, own] & mask[:, slot] & (left[other] > self._radius[vehicle])
-            row = np.flatnonzero(counts)
-            vehicle, other, none = vehicle[row], other[row], np.zeros((len(row), 1))
-            angle = np.arctan2(forward[row, slot, 1], forward[row, slot, 0]) - heading[other]
-            along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-            variances = (axes[other, :1] ** 2, none, none, axes[other, 1:2] ** 2, none, std[other] ** 2)
-            speed = self._top[vehicle][:, None]
-            found.append(_Follower(row, vehicle, place[row, slot], along, speed, PlanarCovariance(*variances)))
-        return [each for each in found if len(each.row)]

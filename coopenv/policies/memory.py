@@ -20,7 +20,7 @@ class Memory:
         """Take the parameters by the names of an agent's weights, and forget everything."""
         self._read, self._keep, *self._bias = (tensors[f"{MEMORY}{part}"] for part in PARTS)
         self.state = np.zeros((0, self._keep.shape[1]), dtype=np.float32)
-        """What the rows remember, (rows, M)."""
+        """State of every row, (rows, M)."""
 
     def reset(self, mask: np.ndarray) -> None:
         """Forget what the rows of a mask (rows,), bool, remember."""

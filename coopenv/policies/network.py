@@ -112,12 +112,8 @@ class Network:
         self._clip = np.float32(network.clip)
         tensors = load_weights(path, network.sha256)
         tensors = {name: values for name, values in tensors.items() if not name.startswith(CRITIC)}
-        self._memory, width = None, 0
-        if f"{MEMORY}{PARTS[0]}" in tensors:
-            remembered = {name: tensors.pop(name) for name in [*tensors] if name.startswith(MEMORY)}
-            width = _width_of(path, remembered, len(self._columns))
-            self._memory = Memory(remembered)
-        depth = _depth_of(path, tensors, len(self._columns), width, len(action))
+        depth = _depth_of(path, tensors, len(self._columns), len(action))
+        self._memory = Memory(tensors) if f"{MEMORY}{PARTS[0]}" in tensors else None
         self._mean, self._std = tensors["observation.mean"], tensors["observation.std"]
         self._layers = [(tensors[f"layers.{i}.weight"].T.copy(), tensors[f"layers.{i}.bias"]) for i in range(depth)]
         self._name, self._seen, self._rows = folder.resolve().name, dict(network.seen), 0
@@ -199,24 +195,18 @@ def load_weights(path: Path, digest: str) -> dict[str, np.ndarray]:
     return tensors
 
 
-def _width_of(path: Path, tensors: Mapping[str, np.ndarray], inputs: int) -> int:
-    """Return the width of a memory. Raises CoopenvError: the weights are not those of one."""
-    width = tensors[f"{MEMORY}{PARTS[0]}"].shape[0] // 3
-    shapes = zip(PARTS, ((3 * width, inputs), (3 * width, width), (3 * width,), (3 * width,)), strict=True)
-    if {name: values.shape for name, values in tensors.items()} != {f"{MEMORY}{part}": shape for part, shape in shapes}:
-        raise CoopenvError(f"{path}: the shapes of {MEMORY}* do not fit {inputs} observations")
-    return width
-
-
-def _depth_of(path: Path, tensors: Mapping[str, np.ndarray], inputs: int, remembered: int, outputs: int) -> int:
+def _depth_of(path: Path, tensors: Mapping[str, np.ndarray], inputs: int, outputs: int) -> int:
     """Return the number of layers. Raises CoopenvError: the weights are not those of a policy of such a width."""
-    names = {"observation.mean", "observation.std", "log_std"}
+    width = tensors[f"{MEMORY}{PARTS[-1]}"].size // 3 if f"{MEMORY}{PARTS[-1]}" in tensors else 0
+    sizes = ((3 * width, inputs), (3 * width, width), (3 * width,), (3 * width,)) if width else ()
+    remembered = {f"{MEMORY}{part}": shape for part, shape in zip(PARTS, sizes, strict=False)}
+    names = {"observation.mean", "observation.std", "log_std", *remembered}
     depth = (len(tensors) - len(names)) // 2
     expected = names | {f"layers.{i}.{part}" for i in range(depth) for part in ("weight", "bias")}
     if set(tensors) != expected or depth < 1:
         raise CoopenvError(f"{path}: not the weights of a policy: {', '.join(sorted(set(tensors) ^ expected))[:80]}")
-    widths = [inputs + remembered, *(tensors[f"layers.{i}.bias"].size for i in range(depth - 1)), outputs]
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("observation.mean", "observation.std"), (inputs,))
+    widths = [inputs + width, *(tensors[f"layers.{i}.bias"].size for i in range(depth - 1)), outputs]
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("observation.mean", "observation.std"), (inputs,)) | remembered
     for i, (before, after) in enumerate(pairwise(widths)):
         shapes |= {f"layers.{i}.weight": (after, before), f"layers.{i}.bias": (after,)}
     fits = all(tensors[name].shape == shape for name, shape in shapes.items())

@@ -21,19 +21,20 @@ class RememberingEnv(VecEnvWrapper):
 
     def __init__(self, venv: NormalisedEnv, width: int) -> None:
         """Wrap a batch for a memory of M = `width` numbers."""
-        bound = venv.observation_space
-        assert isinstance(bound, spaces.Box)
-        low, high = (np.pad(side, (0, width), constant_values=end) for side, end in ((bound.low, -1), (bound.high, 1)))
-        super().__init__(venv, observation_space=spaces.Box(low, high, dtype=np.float32))
+        size = (venv.observation_space.shape or (0,))[0] + width
+        super().__init__(venv, observation_space=spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32))
         self.cell: nn.GRUCell
         self.state = torch.zeros(venv.num_envs, width)
-        """What the rows remember, of their last observation, too."""
+        """State of every row, of its last observation, too."""
         self._restored = False
 
-    @torch.no_grad()
+    def _remembered(self, seen: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            self.state = self.cell(torch.from_numpy(seen), self.state)
+        return self._beside(seen)
+
     def _beside(self, seen: np.ndarray) -> np.ndarray:
-        self.state = self.cell(torch.from_numpy(seen), self.state)
-        return np.concatenate([seen, self.state.numpy()], axis=1)
+        return np.concatenate([seen, self.state.numpy()], axis=1, dtype=np.float32)
 
     def go_on_from(self, state: np.ndarray) -> None:
         """Let the next `reset` go on with what the rows remember, (rows, M). Raises ValueError: of another shape."""
@@ -46,20 +47,20 @@ class RememberingEnv(VecEnvWrapper):
         seen = self.venv.reset()
         if self._restored:
             self._restored = False
-            return np.concatenate([seen, self.state.numpy()], axis=1)
+            return self._beside(seen)
         self.state = torch.zeros_like(self.state)
-        return self._beside(seen)
+        return self._remembered(seen)
 
-    @torch.no_grad()
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Step, remember, and forget what was before the beginning of an episode."""
         seen, rewards, dones, infos = self.venv.step_wait()
         for row in np.flatnonzero(dones):
             last = infos[row]["terminal_observation"]
-            state = self.cell(torch.from_numpy(last), self.state[row])
+            with torch.no_grad():
+                state = self.cell(torch.from_numpy(last), self.state[row])
             infos[row]["terminal_observation"] = np.concatenate([last, state.numpy()])
         self.state[torch.from_numpy(dones | ~self.venv.venv.acted)] = 0.0
-        return self._beside(seen), rewards, dones, infos
+        return self._remembered(seen), rewards, dones, infos
 
 
 class SequencesBuffer(ActingRowsBuffer):
@@ -130,4 +131,4 @@ class RememberingPpo(LeanPpo):
     def pass_back(self, slopes: list[Tensor]) -> None:
         """See `LeanPpo.pass_back`."""
         if not self.critic_alone:
-            self._states.backward(sum(slopes)[:, -self._states.shape[1] :])  # type: ignore[index]
+            self._states.backward(sum(slopes)[:, -self._states.shape[1] :])

@@ -428,13 +428,16 @@ class MeanAction:
 
     def __init__(self, trainer: Trainer, *further: Alone) -> None:
         """Take the policy, and rules beside that of the training."""
-        self._trainer, self._rules = trainer, [*([trainer.rule] if trainer.rule else []), *further]
+        self._trainer = trainer
+        self._rules: list[RightOfWay | Alone] = [*([trainer.rule] if trainer.rule else []), *further]
         self._memory = Memory(trainer.tensors()) if trainer.remembering else None
 
     def reset(self, mask: np.ndarray) -> None:
         """Begin new episodes in the rows of a mask (rows,), bool."""
-        for part in (*self._rules, *([self._memory] if self._memory else [])):
-            part.reset(mask)
+        for rule in self._rules:
+            rule.reset(mask)
+        if self._memory:
+            self._memory.reset(mask)
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return actions without exploration, (rows, A), where vehicles observe (rows, D).

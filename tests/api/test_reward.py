@@ -17,7 +17,6 @@ from coopenv.api.arguments import FIELDS, OTHERS, Step, check_function
 from coopenv.base.errors import CoopenvError
 from coopenv.policies import load_agent
 from coopenv.policies.route_follower import RouteFollower
-from coopenv.policies.scripted import Peek
 from coopenv.scenario import load_scenario
 from sitegen.environments.sensing import DRIVERS, measured_drivers
 from tests.helpers.env_suite import SHIPPED, largest_slow
@@ -196,7 +195,7 @@ def drivers(scenario: Any) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
     return {
         "follow": follow,
         "slow": slow,
-        "peek": Peek(scenario),
+        "peek": load_agent("peek", scenario),
         "look around": lambda seen: np.clip(follow(seen) + turn * np.sin(0.3 * next(step)), -1.0, 1.0),
         "stand": lambda seen: np.tile(np.append([-1.0], np.zeros(len(turn) - 1)), (len(seen), 1)),
     }

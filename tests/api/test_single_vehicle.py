@@ -11,7 +11,6 @@ import pytest
 import coopenv
 from coopenv.api.single_vehicle import SingleVehicleEnv
 from coopenv.policies import load_agent
-from coopenv.policies.scripted import Peek
 
 CROSSING = "coopenv/UrbanCrossing-v0"
 
@@ -45,7 +44,7 @@ def test_others_are_an_agent_or_a_policy() -> None:
     policy = paths_of(SingleVehicleEnv(scenario, others=load_agent("peek", scenario)), 60)
     straight = paths_of(SingleVehicleEnv("urban_crossing"), 60)
     np.testing.assert_array_equal(peek["vehicle_2"], policy["vehicle_2"])
-    of_a_class = paths_of(SingleVehicleEnv("urban_crossing", others=Peek), 60)
+    of_a_class = paths_of(SingleVehicleEnv("urban_crossing", others=type(load_agent("peek", scenario))), 60)
     np.testing.assert_array_equal(peek["vehicle_2"], of_a_class["vehicle_2"])
     assert not np.array_equal(peek["vehicle_2"], straight["vehicle_2"])
     with pytest.raises(coopenv.CoopenvError, match=r"unknown agent 'peak' \(did you mean 'peek'\?\)"):

@@ -14,9 +14,9 @@ from gymnasium.wrappers import vector as wrappers
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from pettingzoo.test import parallel_api_test
 from pettingzoo.utils.wrappers import RecordVideoParallel
+from plain_infos import NUMBERS, PlainInfos
 
 import coopenv
-from coopenv.api.parallel_env import NUMBERS, PlainInfos
 from coopenv.api.vector_env import RecordVehicleEpisodes, TrueEnds
 from tests.helpers.env_suite import first_episodes
 from tests.helpers.four_way import FOUR_WAY

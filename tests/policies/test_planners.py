@@ -11,11 +11,10 @@ import pytest
 from coopenv import parallel_env
 from coopenv.api.terms.layout import observation_layout
 from coopenv.policies import act, load_agent
-from coopenv.policies.look_ahead import LookAhead, TeamLookAhead
+from coopenv.policies.look_ahead import LookAhead
 from coopenv.policies.prediction import FieldOfView, Occluder, Occluders, PlanarCovariance, unhidden
 from coopenv.policies.right_of_way import discs_along, nearest
 from coopenv.policies.route_follower import RouteFollower
-from coopenv.policies.scripted import IntelligentDriver, KeepContact, Peek, StopWhenLost
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.four_way import FOUR_WAY
 from tests.oracles.geometry import is_occluded
@@ -44,7 +43,7 @@ def observation(scenario: Scenario = SCENARIO, **fields: object) -> np.ndarray:
 
 
 def test_peek_turns_to_landmarks_and_back_into_its_lane() -> None:
-    peek = Peek(SCENARIO)
+    peek: Any = load_agent("peek", SCENARIO)
     beside = [[2.5, 3.0, 0.0]] * 3 + [[50.0, 0.0, 0.0]] * 5
     lost = {"position_std": 0.0, "map_position": beside, "map_mask": [1, 1, 1, 0, 0, 0, 0, 0]}
     steering = peek.drive(observation(**lost))[1]
@@ -54,7 +53,7 @@ def test_peek_turns_to_landmarks_and_back_into_its_lane() -> None:
     assert peek.drive(observation(**{**lost, "route_offset": 0.9}))[1][0] <= 0.0  # no farther to the left
 
 
-class Impatient(StopWhenLost):
+class Impatient(type(load_agent("stop_when_lost", SCENARIO))):  # type: ignore[misc]
     threshold, patience = 0.1, 0.3  # m, s
 
 
@@ -79,14 +78,17 @@ def other(x: float, y: float, angle: float) -> dict[str, object]:
 )
 def test_contact_is_kept_by_waiting_for_the_next_car_behind(x: float, speed: float) -> None:
     """Cameras reach 6 m: full speed up to half of it, the slowest pace near its end."""
-    driver = KeepContact(SCENARIO)
+    driver: Any = load_agent("keep_contact", SCENARIO)
     assert driver.drive(observation(**other(x, 0.3, 0.0)))[0][0] == pytest.approx(speed * driver.cruise, rel=0.02)
 
 
 def test_contact_has_the_reach_of_sensors_of_vehicles() -> None:
     tags = {"kind": "relative_pose", "towards": ["landmarks"], "range": 1.0}
     ranges = {"kind": "range", "towards": ["vehicles"], "range": 4.0}
-    assert [KeepContact(square(sensors=sensors)).reach for sensors in ([tags], [tags, ranges])] == [6.0, 4.0]
+    assert [load_agent("keep_contact", square(sensors=sensors)).reach for sensors in ([tags], [tags, ranges])] == [
+        6.0,
+        4.0,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -205,7 +207,8 @@ def test_a_certain_vehicle_passes_closer(std: float, speed: float) -> None:
 
 def test_the_team_planner_keeps_its_whole_deviation_away() -> None:
     lost = observation(position_std=np.log10(0.6))
-    kept = [driver(SCENARIO).distance_to_keep(lost)[0] for driver in (RouteFollower, LookAhead, TeamLookAhead)]
+    team = type(load_agent("team_look_ahead", SCENARIO))
+    kept = [driver(SCENARIO).distance_to_keep(lost)[0] for driver in (RouteFollower, LookAhead, team)]
     assert kept == pytest.approx([0.9, 1.0, 0.85 + 0.6])
 
 
@@ -297,7 +300,7 @@ def test_the_circle_of_another_car_is_measured() -> None:
 
 
 def test_the_intelligent_driver_keeps_its_distance() -> None:
-    driver = IntelligentDriver(SCENARIO)
+    driver: Any = load_agent("idm", SCENARIO)
     free, near = (driver.drive(observation(velocity=[0.5, 0, 0], **way))[0][0] for way in ({}, other(0.9, 0, 0)))
     aside = driver.drive(observation(velocity=[0.5, 0, 0], **other(0.9, 1.0, 0)))[0][0]
     assert near < 0.5 < free == aside
@@ -374,7 +377,7 @@ def test_distances_fit_the_car() -> None:
     assert large.clearance == pytest.approx(large.closest + 0.15 * 5.0 / 0.586)
     assert large.look_ahead == pytest.approx(10.0)  # five decisions at 10 m/s
     assert large.foresight == pytest.approx(2.5)  # 2 s to stop from 10 m/s, and half a second
-    assert Peek(load_scenario("highway_intersection")).ahead == pytest.approx(0.4 * 5.0 / 0.586)
+    assert load_agent("peek", load_scenario("highway_intersection")).ahead == pytest.approx(0.4 * 5.0 / 0.586)
 
 
 def test_cars_of_highway_env_are_steered_on_the_pursued_circle() -> None:

@@ -14,6 +14,7 @@ pytest.importorskip("torchrl", reason="needs the extra 'torchrl'")
 
 import torch
 import torchrl_ppo
+from plain_infos import PlainInfos
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import EnvBase, GymEnv, PettingZooWrapper
@@ -21,7 +22,6 @@ from torchrl.envs.utils import check_env_specs
 from torchrl_env import batched_env
 
 import coopenv
-from coopenv.api.parallel_env import PlainInfos
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.torchrl
