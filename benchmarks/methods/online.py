@@ -1,9 +1,9 @@
-"""Methods that learn while they drive: of BenchMARL, and of `coopenv train`."""
+"""Methods that learn while they drive: of BenchMARL, of `coopenv train`, and sb3-contrib's recurrent PPO."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from contextlib import closing
 from typing import Any, Literal
 
@@ -14,16 +14,21 @@ from benchmarl.experiment import Experiment, ExperimentConfig
 from benchmarl.models import GnnConfig, SequenceModelConfig
 from benchmarl.models.mlp import MlpConfig
 from benchmarl_task import task
+from sb3_contrib import RecurrentPPO
+from sb3_contrib.common.recurrent.buffers import RecurrentRolloutBuffer
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from sb3_contrib.common.recurrent.type_aliases import RecurrentRolloutBufferSamples
 from tensordict import TensorDict
 from torch_geometric.nn.conv import GraphConv
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl_env import GROUP
 
 from coopenv.api.engine import Engine
+from coopenv.api.trainers.sb3 import CooperativeSB3VecEnv
 from coopenv.base.sections import Section
 from coopenv.policies import Policy
 from coopenv.training.command import possible
-from coopenv.training.settings import Settings, TrainingPlan
+from coopenv.training.settings import Ppo, Settings, TrainingPlan
 from coopenv.training.trainer import Trainer
 
 Driver = Callable[[Engine], Policy]
@@ -106,11 +111,95 @@ def benchmarl(environment: str, decisions: int, seed: int, options: dict[str, An
     return lambda engine: GroupDriver(experiment.policy, engine)
 
 
+class ActingSequences(RecurrentRolloutBuffer):
+    """Sequences in whose losses only the decisions of vehicles under way count."""
+
+    def __init__(self, *arguments: Any, rows: CooperativeSB3VecEnv, **options: Any) -> None:
+        self._rows = rows
+        super().__init__(*arguments, **options)
+
+    def reset(self) -> None:
+        """Remove the collected steps."""
+        self._acted = np.zeros((self.buffer_size, self.n_envs, 1), dtype=np.float32)
+        super().reset()
+
+    def add(self, *step: Any, **named: Any) -> None:
+        """Add a step, and which vehicles were under way in it."""
+        self._acted[self.pos, :, 0] = self._rows.acted
+        super().add(*step, **named)
+
+    def get(self, batch_size: int | None = None) -> Generator[RecurrentRolloutBufferSamples, None, None]:
+        """Yield minibatches of sequences."""
+        self._flat = self.swap_and_flatten(self._acted)[:, 0]
+        yield from super().get(batch_size)
+
+    def _get_samples(self, batch_inds: np.ndarray, *others: Any) -> RecurrentRolloutBufferSamples:
+        found = super()._get_samples(batch_inds, *others)
+        return found._replace(mask=self.pad_and_flatten(self._flat[batch_inds]))
+
+
+class ActingRecurrentPpo(RecurrentPPO):
+    """Recurrent PPO that takes what `Trainer` gives an algorithm."""
+
+    rollout_buffer: Any
+
+    def __init__(self, *arguments: Any, rollout_buffer_class: Any, rollout_buffer_kwargs: Any, **options: Any) -> None:
+        self._rows = rollout_buffer_kwargs["rows"]
+        super().__init__(*arguments, **options)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        buffer, spaces = self.rollout_buffer, (self.observation_space, self.action_space)
+        factors = {"gamma": self.gamma, "gae_lambda": self.gae_lambda, "n_envs": self.n_envs, "rows": self._rows}
+        self.rollout_buffer = ActingSequences(self.n_steps, *spaces, buffer.hidden_state_shape, self.device, **factors)
+
+
+class Lstm(RecurrentActorCriticPolicy):
+    """A long short-term memory of 64 units before each of the networks of policy and value."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, lstm_hidden_size=64, **options)
+
+
+class RecurrentTrainer(Trainer):
+    """The training of `coopenv train` with a memory."""
+
+    kinds = (ActingRecurrentPpo, Lstm, ActingSequences)
+
+
+class Remembering:
+    """Drives by a recurrent policy."""
+
+    def __init__(self, trainer: Trainer) -> None:
+        self.trainer, self.state, self.fresh = trainer, None, np.ones(0, dtype=bool)
+
+    def reset(self, mask: np.ndarray) -> None:
+        """Forget the rows where an episode begins."""
+        self.fresh = mask.copy()
+
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        """Return actions, (rows, A)."""
+        seen, model = self.trainer.env.normalise(observations), self.trainer.model
+        actions, self.state = model.predict(seen, self.state, self.fresh, deterministic=True)
+        self.fresh = np.zeros(len(observations), dtype=bool)
+        return np.asarray(actions)
+
+
+class Sb3(Section):
+    """PPO of `coopenv train`, or sb3-contrib's with a memory in the same training."""
+
+    recurrent: bool = False
+    ppo: Ppo = Ppo()
+    """As in its settings."""
+
+
 def coopenv_train(environment: str, decisions: int, seed: int, options: dict[str, Any]) -> Driver:
     """Train by `coopenv train` for so many decisions of vehicles, those of parked vehicles counted in."""
-    plan = TrainingPlan(environment, Settings(steps=decisions, **options), seed)
-    with closing(Trainer(plan, possible(plan), threads=1)) as trainer:
+    asked = Sb3(**options)
+    plan = TrainingPlan(environment, Settings(steps=decisions, ppo=asked.ppo), seed)
+    kind = RecurrentTrainer if asked.recurrent else Trainer
+    with closing(kind(plan, possible(plan), threads=1)) as trainer:
         trainer.begin()
         while trainer.status.share < 1.0:
             trainer.update()
-    return lambda engine: trainer.driver()
+    return lambda engine: Remembering(trainer) if asked.recurrent else trainer.driver()

@@ -201,6 +201,9 @@ class DivergedError(CoopenvError):
 class Trainer:
     """A policy that all vehicles share, and everything that its next update depends on."""
 
+    kinds: tuple[Any, Any, Any] = (LeanPpo, TanhPolicy, ActingRowsBuffer)
+    """Classes of algorithm, policy and buffer, if the settings ask for no memory."""
+
     def __init__(self, plan: TrainingPlan, scenario: Scenario, threads: int | None = None) -> None:
         """Build worlds and networks.
 
@@ -226,13 +229,8 @@ class Trainer:
         """Discount per decision."""
         widths = list(ppo.hidden)
         self.remembering = RememberingEnv(self.env, ppo.memory) if ppo.memory else None
-        kinds = (
-            (RememberingPpo, RememberingPolicy, SequencesBuffer)
-            if ppo.memory
-            else (LeanPpo, TanhPolicy, ActingRowsBuffer)
-        )
-        algorithm, policy, buffer = kinds
-        self.model: LeanPpo = algorithm(
+        algorithm, policy, buffer = (RememberingPpo, RememberingPolicy, SequencesBuffer) if ppo.memory else self.kinds
+        self.model: Any = algorithm(
             policy,
             self.remembering or self.env,
             learning_rate=lambda _: ppo.learning_rate * (1.0 - self._share),

@@ -31,7 +31,7 @@ communication.learner = "benchmarl"
 communication.options = { algorithm = "ippo", communicates = true, worlds = 4, minibatch = 50, hidden = 8 }
 ppo = { learner = "coopenv", options.ppo = { vehicles = 8, decisions = 25, minibatches = 2, hidden = [8] } }
 recurrent.learner = "coopenv"
-recurrent.options = { ppo = { vehicles = 8, decisions = 25, minibatches = 2, hidden = [8], memory = 4 } }
+recurrent.options = { recurrent = true, ppo = { vehicles = 8, decisions = 25, minibatches = 2, hidden = [8] } }
 clone = { learner = "offline", options = { algorithm = "clone", gradient_steps = 5, hidden = 8 } }
 td3_bc = { learner = "offline", options = { algorithm = "td3_bc", gradient_steps = 5, hidden = 8 } }
 """
@@ -53,7 +53,7 @@ def results_of(folder: Path) -> list[dict[str, str]]:
 def test_every_method_trains_and_what_is_finished_is_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for package in ("benchmarl", "torch_geometric", "minari"):
+    for package in ("benchmarl", "torch_geometric", "sb3_contrib", "minari"):
         pytest.importorskip(package, reason="needs the extra 'study'")
     place, page = written(tmp_path, SMALL), tmp_path / "page.md"
     arguments = [str(place), "--data", str(tmp_path / "data"), "--page", str(page)]
@@ -187,12 +187,38 @@ def test_the_verdict_names_a_winner_only_where_intervals_are_apart(shift: float,
     assert report.verdict({"a": [runs], "b": [runs + shift]}).startswith(words)
 
 
+@pytest.mark.train
+def test_recurrent_ppo_learns_from_rows_under_way_alone() -> None:
+    pytest.importorskip("sb3_contrib", reason="needs the extra 'study'")
+    pytest.importorskip("benchmarl", reason="needs the extra 'study'")
+    import torch
+    from gymnasium.spaces import Box
+    from sb3_contrib.common.recurrent.type_aliases import RNNStates
+
+    from benchmarks.methods.online import ActingSequences
+
+    steps, rows, random = 6, 4, np.random.default_rng(0)
+    acted = random.random((steps, rows)) < 0.6
+    batch, space, nothing = SimpleNamespace(acted=acted[0]), Box(-1.0, 1.0, (1,)), torch.zeros(1, rows, 2)
+    buffer = ActingSequences(steps, space, space, (steps, 1, rows, 2), "cpu", n_envs=rows, rows=batch)
+    for step in range(steps):
+        batch.acted = acted[step]
+        seen = np.where(acted[step], 1.0, -1.0)[:, None]
+        zero, state = torch.zeros(rows), RNNStates((nothing, nothing), (nothing, nothing))
+        starts = np.full(rows, step == 0) | (random.random(rows) < 0.2)
+        buffer.add(seen, seen, np.zeros(rows), starts, zero, zero, lstm_states=state)
+    for _ in range(2):
+        samples = [*buffer.get(8)]
+        assert sum(int(each.mask.sum()) for each in samples) == acted.sum()
+        assert all((each.observations[each.mask > 0.5] == 1.0).all() for each in samples)
+
+
 @pytest.mark.slow
 @pytest.mark.benchmarl
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("communicates", [False, True])
 def test_only_with_communication_a_vehicle_acts_on_what_others_observe(communicates: bool) -> None:
-    for package in ("benchmarl", "torch_geometric"):
+    for package in ("benchmarl", "torch_geometric", "sb3_contrib"):
         pytest.importorskip(package, reason="needs the extra 'study'")
     from benchmarks.methods.online import benchmarl
 
