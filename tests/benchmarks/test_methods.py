@@ -60,7 +60,7 @@ def test_every_method_trains_and_what_is_finished_is_kept(
     assert command.main([*arguments, "--only", "1"]) == 0
     assert "8 of 16 runs are finished" in page.read_text()
     first = results_of(tmp_path)
-    assert {row["seed"] for row in first} == {"1"} and len({row["e95_m"] for row in first}) == 8
+    assert {row["seed"] for row in first} == {"1"} and len({row["return"] for row in first}) == 8
     assert command.main(arguments) == 0
     found, shown = results_of(tmp_path), capsys.readouterr()
     assert [row for row in found if row["seed"] == "1"] == first
