@@ -93,6 +93,8 @@ def report(environment: str, worlds: int, block: int, others: Sequence[str]) -> 
         change = _with_error(errors - rule) if np.any(errors != rule) else ""
         rows.append([name, _with_error(errors), change, *(f"{100.0 * share.mean():.0f}" for share in shares)])
     columns = ["driver", "mean error [cm]", f"minus `{environment}_rule` [cm]", "arrived [%]", "collided [%]"]
+    card = find_agent(f"{environment}_team").network
+    alone = f"; without messages `{card.alone}` drives the cars" if card and card.alone else ""
     command = f"python -m benchmarks.teams {environment} --worlds {worlds} --block {block}"
     return "\n\n".join(
         [
@@ -103,7 +105,7 @@ def report(environment: str, worlds: int, block: int, others: Sequence[str]) -> 
             "vehicle, and the difference in "
             f"the same worlds, over {worlds} held-out worlds of block {block}, with standard errors. In the last rows, "
             "fields of the observation read 0, for which the team was not trained: they show what it reads, not what "
-            "a team that is trained without these fields can do.",
+            f"a team that is trained without these fields can do{alone}.",
             markdown(columns, rows),
             f"```\n{command}  # coopenv {version()}\n```",
         ]

@@ -175,16 +175,18 @@ def test_cooperation_costs_the_helpers_and_pays_for_the_fleet(environment: str) 
         assert honest <= 0.5 * dependent_e95(own, environment)
 
 
+SILENT = ("lighthouse", "scout_platoon", "take_turns", "liar_among_us", "pilot", "two_pilots", "relay")
 RADIO_OFF = {"v2x.range": 0.001, "reward.team": "own"}
 
 
-@pytest.mark.parametrize("environment", rest_slow(("lighthouse", "scout_platoon", "take_turns", "liar_among_us"), 0))
+@pytest.mark.parametrize("environment", rest_slow(SILENT, 0))
 def test_a_team_arrives_as_often_without_radio_as_the_planner_of_one_vehicle(environment: str) -> None:
     scenario, worlds = load_scenario(environment, RADIO_OFF), held_out_seeds(9, 32)
     agents = (load_agent(name, scenario) for name in ("look_ahead", f"{environment}_team"))
     alone, team = (drive(Engine(scenario, len(worlds)), agent, worlds).outcome == Outcome.ARRIVED for agent in agents)
     fewer = alone.mean(axis=1) - team.mean(axis=1)
-    assert fewer.mean() <= 2.0 * fewer.std(ddof=1) / np.sqrt(len(fewer)) and alone.mean() > 0.9
+    least = 0.4 if environment in AHEAD else 0.9  # few measure a landmark there
+    assert fewer.mean() <= 2.0 * fewer.std(ddof=1) / np.sqrt(len(fewer)) and alone.mean() > least
 
 
 CLONES = {"lighthouse": 1.15, "take_turns": 1.15, "liar_among_us": 1.15, "scout_platoon": 1.4}
