@@ -267,6 +267,8 @@ def read_settings(
         changed |= {f"arms.{arm}": arms[arm], f"{table}.arms.{arm}": arms_here.get(arm, {})}
     for place, change in changed.items():
         raw = merged(raw, _flattened(change, f"{where}: {place}"))
+    if path is not None and isinstance(raw.get("start"), str) and (path.parent / raw["start"] / AGENT_FILE).is_file():
+        raw["start"] = str(path.parent / raw["start"])  # of the file's folder, wherever the training begins
     raw.update({name: value for name, value in changes.items() if value is not None})
     if changes.get("start") is not None:
         raw.pop("clone", None)

@@ -357,3 +357,14 @@ def test_an_agent_names_files_of_its_folder(tmp_path: Path) -> None:
     card = 'title = "x"\ndescription = "x"\nentry = "mine.py:Mine"\nenvironments = ["square.toml", "facade"]\n'
     (tmp_path / "agent.toml").write_text(card)
     assert find_agent(tmp_path).environments == (str(tmp_path / "square.toml"), "facade")
+
+
+@pytest.mark.parametrize("name", ["pilot_team", "relay_team"])
+def test_an_agent_that_a_training_begins_as_lies_beside_its_settings(name: str) -> None:
+    folder = data_directory("agents") / name
+    settings = read_settings(folder / "train.toml")
+    assert settings.start == str(folder / "first")
+    first, whole = find_agent(settings.start), find_agent(name)
+    assert first.network and whole.network and first.network.observation == whole.network.observation
+    assert first.training["steps"] > 0 and whole.training["command"].endswith(f"--seed {whole.training['seed']}")
+    assert read_settings(folder / "train.toml", start="mine").start == "mine"
