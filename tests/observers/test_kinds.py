@@ -59,17 +59,17 @@ def prediction_of(recording: Recording, k: int, i: int, n: int, poses: list[tupl
 
 def derivative(recording: Recording, k: int, i: int, n: int, poses: list[tuple[Array, Array]]) -> Array:
     """Return (r, 6N) the derivative of a measurement by the left errors of all vehicles, by differences."""
-    kind, at = recording.setups[i].sensors[0].kind, prediction_of(recording, k, i, n, poses)
-    columns = []
-    for j in range(len(poses)):
-        for axis in np.eye(6):
+    [sensor], at = recording.setups[i].sensors, prediction_of(recording, k, i, n, poses)
+    H = np.zeros((sensor.kind.rows, 6 * len(poses)))
+    for j in {i, int(sensor.targets[n]) - recording.landmarks.shape[1]} & {*range(len(poses))}:  # of no others
+        for column, axis in enumerate(np.eye(6), 6 * j):
             ends = []
             for step in (STEP, -STEP):
                 there = [*poses]
                 there[j] = moved(*poses[j], step * axis)
-                ends.append(kind.residual(prediction_of(recording, k, i, n, there), at))
-            columns.append((ends[0] - ends[1]) / (2.0 * STEP))
-    return np.stack(columns, axis=-1)
+                ends.append(sensor.kind.residual(prediction_of(recording, k, i, n, there), at))
+            H[:, column] = (ends[0] - ends[1]) / (2.0 * STEP)
+    return H
 
 
 def first_tick(recording: Recording, vehicle: int) -> Tick:
