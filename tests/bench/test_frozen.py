@@ -51,7 +51,6 @@ def test_an_own_observer_has_its_row_beside_the_zoo(
     """In 3 s of two of the four seeds, which is another scene."""
     copyfile(MINE, tmp_path / "mine.py")
     monkeypatch.chdir(tmp_path)
-    in_this_process(monkeypatch)
     monkeypatch.setattr(Frozen, "definition", short_definition(2, 3.0))
     assert main(["bench", "v1", "mine.py:Ekf,dead_reckoning", "--scenes", "lane", "--jobs", "1"]) == 0
     table = capsys.readouterr().out
