@@ -47,8 +47,7 @@ def on_circle(velocity: np.ndarray, curvature: np.ndarray, times: np.ndarray) ->
     return np.asarray((times * np.sinc(half / np.pi))[..., None] * np.stack([c * x - s * y, s * x + c * y], axis=-1))
 
 
-MOST_PAIRS = 1024
-"""Pairs of vehicles at once: arrays of more do not fit into the processor's cache."""
+MOST_PAIRS = 1024  # of vehicles at once: arrays of more do not fit into the processor's cache
 
 
 def nearest(
@@ -86,9 +85,8 @@ def nearest(
             speed = np.diff(driven, axis=1) / lasts[:, None]
         apart = place[row, other][:, None] + driven[:, :-1] - path[row, :count]
         away = speed - own[row]
-        square = np.maximum(_dot(away, away), 1e-9)
-        time = np.clip(-_dot(apart, away) / square, 0.0, np.minimum(times[1:], until) - times[:-1])
-        closest = apart + time[..., None] * away
+        best = -_dot(apart, away) / np.maximum(_dot(away, away), 1e-9)
+        closest = apart + np.clip(best, 0.0, np.minimum(times[1:], until) - times[:-1])[..., None] * away
         distance[row, other] = np.sqrt(_dot(closest, closest).min(axis=-1))
     return np.asarray(distance.min(axis=1, initial=np.inf))
 
