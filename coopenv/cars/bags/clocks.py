@@ -197,7 +197,7 @@ def fit(e: Array, N: Array, w: Array | None = None, *, scaled: bool = False) -> 
             factors = np.array([0.0, (e * weights).sum() / max(1.0, weights.sum())])
         rest = np.where(there, e - N @ factors, 0.0)
         if w is None and there.any():
-            weights = there * (np.abs(rest) <= CUT * _upper(np.abs(rest[there])) + 1e-9)
+            weights = (there & (np.abs(rest) <= CUT * _upper(np.abs(rest[there])) + 1e-9)).astype(np.float64)
     return rest, weights
 
 
