@@ -170,7 +170,9 @@ def test_a_full_disk_for_errors_changes_no_status(tmp_path: Path) -> None:
 
 
 WITHOUT = """
-import json, os, subprocess, sys
+import json, os, sys
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 
 LIBRARIES = {
     "cryptography", "foxglove", "gtsam", "h5py", "highway_env", "imageio_ffmpeg", "libsumo", "lz4", "mcap", "minari",
@@ -186,22 +188,14 @@ class Filtered:
         return None if name.partition(".")[0] in LIBRARIES else self.finder.find_spec(name, path, target)
 
 sys.meta_path[:] = [Filtered(finder) if hasattr(finder, "find_spec") else finder for finder in sys.meta_path]
-import coopenv.api.engine
-import coopenv.policies
-import coopenv.cars.commands.demo
-import coopenv.runs.recorder
-import coopenv.runs.live
 from coopenv.cli.app import main
 
 for command, folder in json.load(sys.stdin):
-    if os.fork() == 0:
-        os.chdir(folder)
-        os.dup2(os.open("/dev/null", os.O_WRONLY), 1)
-        os.dup2(os.open(folder + ".errors", os.O_WRONLY | os.O_CREAT), 2)
-        sys.argv = ["coopenv", *command.split()]
-        os._exit(main())  # what ends at an exit is not asked for, and takes longer than the command
-    status = os.waitstatus_to_exitcode(os.wait()[1])
-    print(json.dumps([command, status, open(folder + ".errors").read(), sorted(os.listdir(folder))]))
+    os.chdir(folder)
+    sys.argv = ["coopenv", *command.split()]
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as errors:
+        status = main()
+    print(json.dumps([command, status, errors.getvalue(), sorted(os.listdir(folder))]))
 """
 FLEET = ROOT / "examples" / "fleet" / "overtaking.toml"
 COMMANDS = {
@@ -229,7 +223,7 @@ def metadata(name: str) -> bytes:
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str, list[str]]]:
-    """Return the exit status, errors and folder of every command, each run in a fork of one interpreter."""
+    """Return the exit status, errors and folder of every command, all run in one interpreter."""
     orders = []
     for number, command in enumerate(COMMANDS):
         folder = tmp_path_factory.getbasetemp() / f"extras_{number}"

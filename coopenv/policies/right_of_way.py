@@ -38,17 +38,16 @@ def right_of_way(scenario: Scenario) -> np.ndarray:
 
 
 def on_circle(velocity: np.ndarray, curvature: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Return the displacements (rows, M, P, 2), m, of vehicles in times (P,), s, on circles.
+    """Return the displacements (pairs, P, 2), m, of vehicles in times (P,), s, on circles.
 
-    Velocities (rows, M, 2) are in m/s, curvatures (rows, M) in 1/m.
+    Velocities (pairs, 2) are in m/s, curvatures (pairs,) in 1/m.
     """
-    half = (curvature * np.linalg.norm(velocity, axis=-1))[..., None] * (times / 2.0)  # rad, from velocity to chord
-    (x, y), c, s = np.moveaxis(velocity[..., None, :], -1, 0), np.cos(half), np.sin(half)
+    half = (curvature * np.linalg.norm(velocity, axis=-1))[:, None] * (times / 2.0)  # rad, from velocity to chord
+    (x, y), c, s = velocity.T[..., None], np.cos(half), np.sin(half)
     return np.asarray((times * np.sinc(half / np.pi))[..., None] * np.stack([c * x - s * y, s * x + c * y], axis=-1))
 
 
-MOST_ROWS = 256
-"""Rows at once: arrays of more do not fit into the processor's cache."""
+MOST_PAIRS = 1024  # of vehicles at once: 3,000 pairs take 5 ms, and 7 ms at once, beyond the processor's cache
 
 
 def nearest(
@@ -71,26 +70,27 @@ def nearest(
         until: s.
         curvature: (rows, M), 1/m, of the circles that others drive along, of which chords are taken; None: straight on.
     """
-    if len(path) > MOST_ROWS:
-        parts = []
-        for first in range(0, len(path), MOST_ROWS):
-            part = slice(first, first + MOST_ROWS)
-            bends = None if curvature is None else curvature[part]
-            parts.append(nearest(path[part], times, place[part], velocity[part], mask[part], until, bends))
-        return np.concatenate(parts)
     count = int(np.searchsorted(times[1:-1], until)) + 1  # of the lines that begin before
     own = np.diff(path[:, : count + 1], axis=1) / np.diff(times[: count + 1])[:, None]
     if count == len(times) - 1:
         times = np.append(times[:-1], max(until, times[-1]))
     times, lasts = times[: count + 1], np.diff(times[: count + 1])
-    speed = velocity[:, :, None]
-    driven = speed * times[:, None]
-    if curvature is not None:
-        driven = on_circle(velocity, curvature, times)
-        speed = np.diff(driven, axis=2) / lasts[:, None]
-    apart = place[:, :, None] + driven[:, :, :-1] - path[:, None, :count]
-    away = speed - own[:, None]
-    square = np.maximum((away**2).sum(axis=-1), 1e-9)
-    time = np.clip(-(apart * away).sum(axis=-1) / square, 0.0, np.minimum(times[1:], until) - times[:-1])
-    distance = np.linalg.norm(apart + time[..., None] * away, axis=-1).min(axis=-1)
-    return np.asarray(np.min(distance, axis=1, where=mask, initial=np.inf))
+    distance, pairs = np.full(mask.shape, np.inf), np.argwhere(mask)
+    for first in range(0, len(pairs), MOST_PAIRS):
+        row, other = pairs[first : first + MOST_PAIRS].T
+        speed = velocity[row, other][:, None]
+        driven = speed * times[:, None]
+        if curvature is not None:
+            driven = on_circle(velocity[row, other], curvature[row, other], times)
+            speed = np.diff(driven, axis=1) / lasts[:, None]
+        apart = place[row, other][:, None] + driven[:, :-1] - path[row, :count]
+        away = speed - own[row]
+        best = -_dot(apart, away) / np.maximum(_dot(away, away), 1e-9)
+        closest = apart + np.clip(best, 0.0, np.minimum(times[1:], until) - times[:-1])[..., None] * away
+        distance[row, other] = np.sqrt(_dot(closest, closest).min(axis=-1))
+    return np.asarray(distance.min(axis=1, initial=np.inf))
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the scalar products of vectors (..., 2): several times as fast as a sum along so short an axis."""
+    return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1])

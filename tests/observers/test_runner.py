@@ -115,7 +115,7 @@ def test_arrays_of_another_length_or_precision() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_no_bearing_need_fit(name: str) -> None:
     """Not even one of a frame, for any observer."""
-    made = record(load_scenario("lane:3", {"horizon": 1.0}), 0)
+    made = recording("lane:3")
     drawn = np.random.default_rng(0).standard_normal(made.bearings.shape)
     random = np.where(made.visible[..., None], drawn / np.linalg.norm(drawn, axis=-1, keepdims=True), made.bearings)
     completed(name, replace(made, bearings=random))

@@ -197,8 +197,16 @@ def fit(e: Array, N: Array, w: Array | None = None, *, scaled: bool = False) -> 
             factors = np.array([0.0, (e * weights).sum() / max(1.0, weights.sum())])
         rest = np.where(there, e - N @ factors, 0.0)
         if w is None and there.any():
-            weights = there * (np.abs(rest) <= CUT * np.quantile(np.abs(rest[there]), 0.9) + 1e-9)
+            weights = (there & (np.abs(rest) <= CUT * _upper(np.abs(rest[there])) + 1e-9)).astype(np.float64)
     return rest, weights
+
+
+def _upper(values: Array) -> float:
+    """Return the quantile 0.9 of values (n,); `np.quantile` takes ten times as long for some hundreds of them."""
+    place = 0.9 * (len(values) - 1)
+    low = int(place)
+    first, last = np.partition(values, (low, min(low + 1, len(values) - 1)))[low : low + 2][[0, -1]]
+    return float(first + (place - low) * (last - first))
 
 
 def lead_by(residual: Residual, times: Array, most: float, least: float, *, scaled: bool = False) -> Lead | None:

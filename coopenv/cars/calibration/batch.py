@@ -175,33 +175,36 @@ class Batch:
         `near`: constants by whose offsets keyframes are assigned, and from which offsets act (None: x).
         """
         near = x if near is None else near
-        car, own, start, keys = self.cars[c], x[self.own(c)], near[self.own(c)], self.keys[c]
-        path = self.path(c, x)
+        car, own, keys, path = self.cars[c], x[self.own(c)], self.keys[c], self.path(c, x)
         place, yaw = pose[:, 0] + 1j * pose[:, 1], pose[:, 2]
-
-        def carried(time: Array, offset: int) -> tuple[NDArray[np.complex128], Array]:
-            """Return places and headings at times whose offset is a constant."""
-            when = time + start[offset]
-            k = self.nearest(c, when)
-            moved, turned = path.step(keys[k], when, own[offset] - start[offset])
-            return place[k] + np.exp(1j * yaw[k]) * moved, yaw[k] + turned
-
-        at, heading = carried(car.time, CAMERA_TIME)
-        points = self.places + x[self.markers : self.frame].reshape(-1, 3)
-        point = points[car.target]
-        flat = np.exp(-1j * heading) * (point[:, 0] + 1j * point[:, 1] - at)
-        body = np.stack([flat.real, flat.imag, point[:, 2] - car.height], axis=-1) - car.lever - own[LEVER]
-        ray = body @ (Rotation.from_rotvec(own[ROT]).as_matrix() @ car.mounting)
-        seen = self._off(car, own, ray)
+        seen = self.sightings(c, x, *self.carried(c, x, pose, car.time, CAMERA_TIME, near))
         step, bend = path.step(keys[:-1], keys[1:])
         gap = np.exp(-1j * yaw[:-1]) * np.diff(place) - step
         odometry = np.stack([gap.real, gap.imag, np.diff(yaw) - bend], axis=-1)
-        at, heading = carried(car.truth_time, TRUTH_TIME)
+        at, heading = self.carried(c, x, pose, car.truth_time, TRUTH_TIME, near)
         offset, frame = own[BODY], x[self.frame :]
         at = at + np.exp(1j * heading) * (offset[1] + 1j * offset[2])
         at = np.exp(1j * frame[0]) * at + frame[1] + 1j * frame[2]
         gap, angle = car.truth - at, car.truth_yaw - heading - offset[0] - frame[0]
         return seen, odometry, np.stack([gap.real, gap.imag, (angle + np.pi) % (2 * np.pi) - np.pi], axis=-1)
+
+    def carried(
+        self, c: int, x: Array, pose: Array, time: Array, offset: int, near: Array
+    ) -> tuple[NDArray[np.complex128], Array]:
+        """Return places (m) and headings (rad) of a car at times (s) whose offset is a constant; `near`: see there."""
+        start = near[self.own(c)][offset]
+        when = time + start
+        k = self.nearest(c, when)
+        moved, turned = self.path(c, x).step(self.keys[c][k], when, x[self.own(c)][offset] - start)
+        return pose[k, 0] + 1j * pose[k, 1] + np.exp(1j * pose[k, 2]) * moved, pose[k, 2] + turned
+
+    def sightings(self, c: int, x: Array, at: NDArray[np.complex128], heading: Array) -> Array:
+        """Return the residuals (n, 2) of sightings from places, m, and headings, rad."""
+        car, own = self.cars[c], x[self.own(c)]
+        point = (self.places + x[self.markers : self.frame].reshape(-1, 3))[car.target]
+        flat = np.exp(-1j * heading) * (point[:, 0] + 1j * point[:, 1] - at)
+        body = np.stack([flat.real, flat.imag, point[:, 2] - car.height], axis=-1) - car.lever - own[LEVER]
+        return self._off(car, own, body @ (Rotation.from_rotvec(own[ROT]).as_matrix() @ car.mounting))
 
     def nearest(self, c: int, time: Array) -> NDArray[np.int64]:
         """Return the keyframes that are nearest to times."""
@@ -276,11 +279,14 @@ class Batch:
             value.append(np.where((key % 2 == parity) | (after > 0), change, 0.0))
         place = np.tile(np.arange(len(r)), 6), np.concatenate(column)
         P = csr_array((np.concatenate(value), place), shape=(len(r), 3 * M))
-        J = np.zeros((len(r), len(columns)))
+        J, at = np.zeros((len(r), len(columns))), self.carried(c, fit.x, pose, car.time, CAMERA_TIME, fit.x)
+        optical = (columns >= self.markers) & (columns < self.frame)  # they move no car
+        optical |= (columns >= self.own(c).start) & (columns < self.own(c).start + LENS.stop)
         for n, constant in enumerate(columns):
             x = fit.x.copy()
             x[constant] += self.steps[constant]
-            J[:, n] = (_flat(self.residuals(c, x, pose, fit.x)) - r) / self.steps[constant]
+            found = self.sightings(c, x, *at).ravel() if optical[n] else _flat(self.residuals(c, x, pose, fit.x))
+            J[: len(found), n] = (found - r[: len(found)]) / self.steps[constant]
         return r, W, P, J
 
     def solved(self, fit: Fit, columns: NDArray[np.int64]) -> "System":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,11 @@ def solved_of(given: CalibrationDrive, truth: bool) -> Any:
     return solved(given, truth, first_constants(Batch(given, truth)))
 
 
+@cache
+def without_truth() -> Any:
+    return solved_of(unknown(drive()), False)
+
+
 def test_markers_are_solved_with_motion_capture() -> None:
     _, _, places, starts = solved_of(unknown(drive()), True)
     assert np.sqrt(np.mean(np.sum((places - MARKERS) ** 2, axis=-1))) < 0.01
@@ -51,7 +57,7 @@ def test_markers_are_solved_with_motion_capture() -> None:
 
 def test_markers_are_solved_without_motion_capture_in_the_frame_of_the_start() -> None:
     """Up to where the frame lies; the scale of the wheels, 2 % off, is seen by the camera's lever."""
-    _, _, places, starts = solved_of(unknown(drive()), False)
+    _, _, places, starts = without_truth()
     assert_allclose(starts, 0.0, atol=1e-12)
     true, found = (table[:, 0] + 1j * table[:, 1] for table in (MARKERS, places))
     true, found = true - true.mean(), found - found.mean()
@@ -62,7 +68,7 @@ def test_markers_are_solved_without_motion_capture_in_the_frame_of_the_start() -
 
 
 def test_errors_without_motion_capture_are_about_the_markers_themselves() -> None:
-    batch, fit, places, _ = solved_of(unknown(drive()), False)
+    batch, fit, places, _ = without_truth()
     error = place_errors(batch, fit)
     assert error.shape == places.shape and error.min() > 0.0 and error.max() < 0.05
     given = unknown(drive())
