@@ -25,7 +25,7 @@ from coopenv.cars.link.connect import open_transport
 from coopenv.cars.link.keys import Signer, Verifier, load_keys
 from coopenv.cars.link.transport import Arrival, ReceivingTransport, Transport
 from coopenv.cars.messages.codec import encode, make, warm_up
-from coopenv.cars.messages.readings import Sample
+from coopenv.cars.messages.readings import Sample, is_plausible
 from coopenv.cars.messages.v2x import estimate_message, report_message
 from coopenv.cars.settings.deployment import Deployment, load_deployment
 from coopenv.cars.settings.profile import RESET_TOPIC, VELOCITY, Role, presence_of
@@ -233,8 +233,9 @@ class Svea:
             if self.recorder is not None:
                 self.recorder.write(arrival.topic, arrival.payload, arrival.received)
             for sample in self.intake.samples(arrival):
-                if self._assembler.put(sample):
+                if used := self._assembler.put(sample):
                     self.monitor.put(sample)
+                if used or not is_plausible(sample):  # in another unit, as every stream tells together
                     self._streams.put(sample)
         self.monitor.looked = self.pacer.now()
 
@@ -412,7 +413,6 @@ def examined_arrivals(arrivals: Sequence[Arrival], fleet: Deployment) -> list[Fi
     binding = bind(scenario, fleet.cars, fleet.markers, fleet.file.name, None, fleet.profile)
     intake = Intake(binding, fleet.sensors)
     samples = [sample for arrival in arrivals for sample in intake.samples(arrival)]
-    samples.sort(key=lambda sample: sample.stamp)
     found = examined(samples, binding, fleet.sensors.trust, intake.lenses, constants=True)
     return [finding for some in found.values() for finding in some]
 

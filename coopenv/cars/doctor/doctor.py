@@ -16,6 +16,7 @@ import numpy as np
 from coopenv.cars.bags.clocks import CAMERAS
 from coopenv.cars.calibration.drives import CalibrationDrive
 from coopenv.cars.doctor.constants import of_constants
+from coopenv.cars.doctor.conventions import of_conventions
 from coopenv.cars.doctor.finding import Diagnosis, Finding, Treatment
 from coopenv.cars.doctor.motion import of_frozen_streams, of_noise, of_turning, of_velocity, turns_contradict
 from coopenv.cars.doctor.sight import exchanged_bodies, of_sight
@@ -127,7 +128,7 @@ def _unnamed(car: CarStreams, named: Sequence[Diagnosis]) -> Iterator[list[Diagn
     known = {_words(each.finding) for each in named}
     unexplained = any(each.change is None and each.finding.subject == car.topic([Role.TRUTH]) for each in named)
     checks: list[Check] = [_of_unmeasured, _of_constant_turning, of_frozen_streams]
-    checks += [*([] if unexplained else [of_sight]), partial(_of_motion, unexplained=unexplained)]
+    checks += [*([] if unexplained else [of_conventions, of_sight]), partial(_of_motion, unexplained=unexplained)]
     for check in checks:
         if new := [each for each in check(car) if _words(each.finding) not in known]:
             yield new
