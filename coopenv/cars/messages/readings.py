@@ -453,8 +453,7 @@ def tracks_of(samples: Sequence[Sample], start: int) -> dict[str, Any]:
             wheel += [] if value.linear is None else [(t, complex(*value.linear[:2]))]
             gyro += [] if value.angular is None else [(t, value.angular[2])]
         elif isinstance(value, CarPose) and value.rotation is not None and s.role is Role.TRUTH:
-            pose = np.column_stack([value.rotation, value.position])
-            truth.append((t, complex(*value.position[:2]), yaw_of(value.rotation), pose))
+            truth.append((t, complex(*value.position[:2]), yaw_of(value.rotation), pose_of(value)))
         elif isinstance(value, MotionCommand):
             command.append((t, value.speed, value.steering))
     columns = [*_columns(wheel, 2), *_columns(gyro, 2), *_columns(truth, 4), *_columns(command, 3)]
@@ -480,6 +479,12 @@ def sightings_of(
 def yaw_of(rotation: Array) -> float:
     """Return the heading of a rotation (3, 3), rad."""
     return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+
+def pose_of(value: CarPose) -> Array:
+    """Return the rotation beside the position (3, 4) of a pose that has both."""
+    assert value.rotation is not None
+    return np.column_stack([value.rotation, value.position])
 
 
 def _columns(rows: Sequence[Any], count: int) -> list[Any]:
