@@ -92,8 +92,7 @@ class Assembler:
         self._inbox = NeighbourInbox(binding, self.refused)
 
     def put(self, sample: Sample) -> bool:
-        """Take a sample; return whether it is of a known car, of a plausible value and time, and newer than those before.
-        """
+        """Take a sample; return whether it is of a known car, of a plausible value and time, and newer than those before."""
         key = car, role = sample.car, sample.role
         why = ""
         if car not in self.binding.leaders and car not in self.binding.cars:

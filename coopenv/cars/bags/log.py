@@ -29,7 +29,16 @@ from coopenv.cars.doctor.timing import of_timing
 from coopenv.cars.gate.wheel_command import read_drive
 from coopenv.cars.messages.codec import encode, stamp_of
 from coopenv.cars.messages.detectors import PLACED
-from coopenv.cars.messages.readings import OTHER_FIELDS, CarPose, Detections, Sample, Twist, Value, read, without_outliers
+from coopenv.cars.messages.readings import (
+    OTHER_FIELDS,
+    CarPose,
+    Detections,
+    Sample,
+    Twist,
+    Value,
+    read,
+    without_outliers,
+)
 from coopenv.cars.messages.stated import stated
 from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.profile import Role

@@ -8,7 +8,17 @@ import numpy as np
 
 from coopenv.base.errors import DataError
 from coopenv.cars.calibration.batch import Batch, Fit
-from coopenv.cars.calibration.calibrate import INTRINSICS, MOST, corrected, errors, exchanged, parts_of, row_of, unexplained, wrong
+from coopenv.cars.calibration.calibrate import (
+    INTRINSICS,
+    MOST,
+    corrected,
+    errors,
+    exchanged,
+    parts_of,
+    row_of,
+    unexplained,
+    wrong,
+)
 from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive
 from coopenv.cars.doctor.finding import Finding, Treatment
 from coopenv.cars.doctor.motion import SPEED_FACTORS

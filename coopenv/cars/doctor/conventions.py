@@ -120,9 +120,7 @@ def of_conventions(car: CarStreams) -> Iterator[Diagnosis]:
         few = thinned(car.with_poses(candidate.poses(car)))
         misfit = 0.0 if few is None else sight_of(few).misfit()
         best[candidate.text] = min(best.get(candidate.text, (np.inf, candidate)), (misfit, candidate), key=first)
-    tried = [
-        (agreement(car.with_poses(one.poses(car))), one) for _, one in sorted(best.values(), key=first)[:TRIED]
-    ]
+    tried = [(agreement(car.with_poses(one.poses(car))), one) for _, one in sorted(best.values(), key=first)[:TRIED]]
     agreeing, one = max(tried, key=lambda entry: len(entry[0]), default=(given, None))
     if one is not None and len(agreeing) > max(1, len(given)):
         text = f"motion capture of {car.name} has other conventions: {one.text}. "

@@ -60,7 +60,9 @@ def of_slip(car: CarStreams, place: SampledSignal, heading: SampledSignal) -> It
     worst = float(slipped[np.argmax(np.abs(slipped - best.factor))]) if len(slipped) else np.inf
     listed = ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in times[:SHOWN])
     more = f" and {len(times) - SHOWN} more" if len(times) > SHOWN else ""
-    text = f"the velocity of {car.name} slips for {lasted:.1f} s, {lasted / whole:.0%} of the drive, from {listed}{more}: "
+    text = (
+        f"the velocity of {car.name} slips for {lasted:.1f} s, {lasted / whole:.0%} of the drive, from {listed}{more}: "
+    )
     text += f"the wheels measure up to {worst:.2g} times the motion by motion capture, and {best.factor:.3g} times else"
 
     def change(car: CarStreams) -> CarStreams:
