@@ -25,7 +25,7 @@ from coopenv.cars.gate.gate import MOST_AHEAD
 from coopenv.cars.link.transport import Arrival, Transport
 from coopenv.cars.messages.codec import decode, stamp_of
 from coopenv.cars.messages.detectors import PLACED
-from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist, Value, is_plausible, read
+from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist, Value, implausible, read
 from coopenv.cars.messages.stated import stated
 from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.deployment import Deployment
@@ -92,7 +92,7 @@ class Assembler:
         self._inbox = NeighbourInbox(binding, self.refused)
 
     def put(self, sample: Sample) -> bool:
-        """Take a sample; return whether it is of a known car, of a plausible value and time, and newer than those before."""
+        """Take a sample; return whether it is of a known car, plausible, and newer than all before of it."""
         key = car, role = sample.car, sample.role
         why = ""
         if car not in self.binding.leaders and car not in self.binding.cars:
@@ -101,7 +101,7 @@ class Assembler:
             why = "stamp in the future"
         elif sample.stamp <= self._newest.get(key, -1):
             why = f"{KINDS.get(role, 'message')} out of order"
-        elif not is_plausible(sample):
+        elif implausible(sample):
             why = "velocity of no car"
         if why:
             self.refused[why] += 1

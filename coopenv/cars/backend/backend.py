@@ -25,7 +25,7 @@ from coopenv.cars.link.connect import open_transport
 from coopenv.cars.link.keys import Signer, Verifier, load_keys
 from coopenv.cars.link.transport import Arrival, ReceivingTransport, Transport
 from coopenv.cars.messages.codec import encode, make, warm_up
-from coopenv.cars.messages.readings import Sample, is_plausible
+from coopenv.cars.messages.readings import Sample, implausible
 from coopenv.cars.messages.v2x import estimate_message, report_message
 from coopenv.cars.settings.deployment import Deployment, load_deployment
 from coopenv.cars.settings.profile import RESET_TOPIC, VELOCITY, Role, presence_of
@@ -235,7 +235,7 @@ class Svea:
             for sample in self.intake.samples(arrival):
                 if used := self._assembler.put(sample):
                     self.monitor.put(sample)
-                if used or not is_plausible(sample):  # in another unit, as every stream tells together
+                if used or implausible(sample):  # in another unit, as every stream tells together
                     self._streams.put(sample)
         self.monitor.looked = self.pacer.now()
 

@@ -252,7 +252,7 @@ def read(
         distorted: `bearings` were computed from distorted pixels.
         known: markers that there are; detections of others are dropped and counted (None: all count).
         vision: markers in the frames of a camera.
-        any_unit: a velocity may be in another unit than m/s and rad/s; see `check_motion`.
+        any_unit: a velocity may be in another unit than m/s and rad/s; see `implausible`.
 
     Raises:
         CoopenvError: one line that names the role and the field: a type that the role has not, a value that is not
@@ -267,8 +267,8 @@ def read(
             return calibration_of(message, vision.rectified)
         if role not in (Role.DETECTIONS, Role.BEARINGS):
             value = readers[kind](message)
-            if isinstance(value, Twist) and not any_unit:
-                check_motion(value, role)
+            if not any_unit and (why := implausible(Sample("", role, 0, 0, value))):
+                raise CoopenvError(why)
             return value
         needed = kind not in PLACED and (role is Role.DETECTIONS or distorted)
         if needed and calibration is None:
@@ -281,21 +281,14 @@ def read(
         raise CoopenvError(f"{role}: {kind} has other fields than expected ({error})") from None
 
 
-def check_motion(value: Twist, role: Role) -> None:
-    """Refuse a velocity that is no car's in m/s and rad/s. Raises CoopenvError."""
-    turning = "angular_velocity" if role is Role.IMU else "twist.angular"
-    for field, part, most in (("twist.linear", value.linear, FASTEST), (turning, value.angular, SPINNING)):
-        if part is not None:
-            numbers_of(part, field, most)
-
-
-def is_plausible(sample: Sample) -> bool:
-    """Return whether a car may move like a sample, if that is a velocity."""
-    with suppress(CoopenvError):
-        if isinstance(sample.value, Twist):
-            check_motion(sample.value, sample.role)
-        return True
-    return False
+def implausible(sample: Sample) -> str:
+    """Return in words why a velocity is no car's in m/s and rad/s; empty: it may be one, or is none."""
+    value, turning = sample.value, "angular_velocity" if sample.role is Role.IMU else "twist.angular"
+    if isinstance(value, Twist):
+        for field, part, most in (("twist.linear", value.linear, FASTEST), (turning, value.angular, SPINNING)):
+            if part is not None and not (np.abs(part) <= most).all():
+                return f"{field}: {shown(part.tolist())} is not finite, or beyond {most:g}"
+    return ""
 
 
 def without_outliers(samples: Sequence[Sample], refused: Counter[str]) -> list[Sample]:
@@ -303,18 +296,11 @@ def without_outliers(samples: Sequence[Sample], refused: Counter[str]) -> list[S
 
     If they are common, the topic is in another unit, which the doctor names: all samples are returned.
     """
-    found, outlying = [], Counter[str]()
-    for sample in samples:
-        try:
-            if isinstance(sample.value, Twist):
-                check_motion(sample.value, sample.role)
-            found.append(sample)
-        except CoopenvError as error:
-            outlying[f"{sample.role}: {error}"] += 1
-    if outlying.total() > COMMON * len(samples):
+    why = [implausible(sample) for sample in samples]
+    if sum(map(bool, why)) > COMMON * len(samples):
         return [*samples]
-    refused += outlying
-    return found
+    refused.update(f"{sample.role}: {text}" for sample, text in zip(samples, why, strict=True) if text)
+    return [sample for sample, text in zip(samples, why, strict=True) if not text]
 
 
 def _twist(twist: Any) -> Twist:

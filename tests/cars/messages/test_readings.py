@@ -307,7 +307,8 @@ def test_rays_of_pixels_go_right_and_down() -> None:
 
 
 def test_single_velocities_of_no_car_are_left_out_and_a_topic_in_another_unit_is_not() -> None:
-    value = read(Role.WHEEL, make(SVEA.topics[Role.WHEEL].type, twist={"twist": ((450.0, 0.0, 0.0), (0.0, 0.0, 0.0))}), any_unit=True)
+    fast = {"twist": ((450.0, 0.0, 0.0), (0.0, 0.0, 0.0))}
+    value = read(Role.WHEEL, make(SVEA.topics[Role.WHEEL].type, twist=fast), any_unit=True)
     assert isinstance(value, Twist) and value.linear is not None and value.linear[0] == 450.0
     slow = Twist(np.array([0.4, 0.0, 0.0]), None)
     some = [Sample("car", Role.WHEEL, n, n, value if n == 50 else slow) for n in range(100)]
