@@ -233,10 +233,13 @@ class Svea:
             if self.recorder is not None:
                 self.recorder.write(arrival.topic, arrival.payload, arrival.received)
             for sample in self.intake.samples(arrival):
-                if used := self._assembler.put(sample):
+                if self._assembler.put(sample):
                     self.monitor.put(sample)
-                if used or implausible(sample):  # in another unit, as every stream tells together
-                    self._streams.put(sample)
+                elif why := implausible(sample):
+                    self.monitor.odd[sample.car, sample.role] = why
+                else:
+                    continue
+                self._streams.put(sample)  # in whatever unit: the streams together show it
         self.monitor.looked = self.pacer.now()
 
     def _counted(self, tick: Sensed) -> Sensed:

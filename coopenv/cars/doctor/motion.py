@@ -28,6 +28,7 @@ FACTORS = {
 SPEED_FACTORS = {
     "the other sign": -1.0,
     "km/h instead of m/s": 3.6,
+    "mph instead of m/s": 2.23694,
     "mm/s instead of m/s": 1000.0,
     "cm/s instead of m/s": 100.0,
     "m/s taken for km/h": 1.0 / 3.6,
@@ -49,6 +50,8 @@ SURE, LAGS = 0.9, (*np.arange(-1.0, 0.0, 0.1), *np.arange(0.1, 1.05, 0.1))
 """Share of the variance from which no other lag is tried, and lags, s."""
 IN_THE_ROOM = "is in the frame of"
 """Words of a velocity that is not in the body's frame."""
+TURNING_WHEEL, RPM = 2.0, 30.0 / math.pi
+"""Factor from which speeds may be a wheel's turn rates, and rpm of 1 rad/s."""
 LEAST = 0.05
 """Practical size: a scale by which 20 s of driving at 0.3 m/s are 0.3 m off without bearings."""
 
@@ -73,8 +76,8 @@ def turning_factor(car: CarStreams, heading: SampledSignal, axis: int = 2) -> Re
 
 def named(factor: float, factors: dict[str, float], within: float = NAMED) -> tuple[str, float] | None:
     """Return the name of a factor and its exact value, from which it may differ by a share; None: it has none."""
-    close = [(name, value) for name, value in factors.items() if abs(factor / value - 1.0) < within]
-    return close[0] if close else None
+    name, value = min(factors.items(), key=lambda entry: abs(factor / entry[1] - 1.0))
+    return (name, value) if abs(factor / value - 1.0) < within else None
 
 
 def of_turning(car: CarStreams, use_truth: bool) -> Iterator[Diagnosis]:
@@ -289,6 +292,8 @@ def _velocity(car: CarStreams, topic: str, what: str, body: Relation) -> Diagnos
     treatment = Treatment.REFUSED if abs(size - 1.0) > 0.3 else Treatment.USED
     if known is not None:
         text, treatment = f"{text} ({known[0]})", Treatment.MENDED
+    elif size > TURNING_WHEEL:
+        text += f" (of a wheel with a radius of {1.0 / size:.2g} m in rad/s, or of {RPM / size:.2g} m in rpm?)"
     parts = (f"{car.name}: wheel scale",) if known is None else ()
     return Diagnosis(Finding(topic, text, signed, body.error, key, treatment, car.name), moved_by(1.0 / exact), parts)
 

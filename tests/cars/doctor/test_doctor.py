@@ -194,6 +194,13 @@ FAULTS: dict[str, tuple[Change, str, Treatment | None]] = {
     "gyro with other axes": (axes, "turns about the x axis", Treatment.REFUSED),
     "wheels reversed": (twist(linear=-1.0), "velocity of car .* other sign", Treatment.MENDED),
     "wheels in km/h": (twist(linear=3.6), "velocity of car .*km/h instead of m/s", Treatment.MENDED),
+    "wheels in mph": (twist(linear=2.237), "velocity of car .*mph instead of m/s", Treatment.MENDED),
+    "wheels in mm/s": (twist(linear=1000.0), "velocity of car .*mm/s instead of m/s", Treatment.MENDED),
+    "wheels in rpm": (
+        twist(linear=9.549 / 0.05),
+        r"velocity of car is 19\d\(?\d?.* in rad/s, or of 0.0[45]\d? m in rpm",
+        Treatment.REFUSED,
+    ),
     "wheels end": (twist(linear=0.0, after=12.0), "velocity of car is 0 m/s in a row", Treatment.REFUSED),
     "truth in mm": (pose(lambda p: 1000.0 * p, float), "motion capture of car.* it is in mm", Treatment.USED),
     "truth mirrored": (pose(lambda p: p * [1, -1, 1], lambda a: -a), "motion capture .* mirrored", Treatment.USED),
