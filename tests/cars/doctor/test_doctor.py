@@ -715,6 +715,10 @@ def test_recordings_go_through_the_same_checks() -> None:
     ("change", "words", "treatment"),
     [
         (FAULTS["wheels in km/h"][0], "km/h instead of m/s", Treatment.REFUSED),
+        (FAULTS["wheels in mm/s"][0], "mm/s instead of m/s", Treatment.REFUSED),
+        (FAULTS["inverse poses"][0], "its poses are inverse", Treatment.REFUSED),
+        (FAULTS["truth flips"][0], "flips to another heading", Treatment.REFUSED),
+        (FAULTS["wheels slip"][0], "slips for", Treatment.USED),
         (FAULTS["truth mirrored"][0], "it is mirrored", Treatment.REFUSED),
         (FAULTS["image mirrored"][0], "its image is mirrored", Treatment.REFUSED),
         (twist(linear=1.15), r"velocity of car is 1\.1[67]", Treatment.USED),
