@@ -115,7 +115,7 @@ def of_conventions(car: CarStreams) -> Iterator[Diagnosis]:
     given = agreement(car)
     if "bearings" in given or (len(given) > 1 and thinned(car) is None):
         return
-    best: dict[str, tuple[float, Convention]] = {}  # those of one text differ in yaw, which bearings tell
+    best: dict[str, tuple[float, Convention]] = {}  # those of one text differ in yaw, on which bearings decide
     for candidate in conventions(car):
         few = thinned(car.with_poses(candidate.poses(car)))
         misfit = 0.0 if few is None else sight_of(few).misfit()

@@ -77,4 +77,5 @@ def _usual(offset: NDArray[np.complex128], within: float) -> NDArray[np.bool_]:
     """Return which offsets (n,) are those of most messages."""
     rows = offset[:: 1 + len(offset) // 200]
     near = np.abs(rows[:, None] - rows) < within
-    return np.abs(offset - rows[int(near.sum(axis=1).argmax())]) < within
+    usual: NDArray[np.bool_] = np.abs(offset - rows[int(near.sum(axis=1).argmax())]) < within
+    return usual
