@@ -25,7 +25,7 @@ from coopenv.cars.gate.gate import MOST_AHEAD
 from coopenv.cars.link.transport import Arrival, Transport
 from coopenv.cars.messages.codec import decode, stamp_of
 from coopenv.cars.messages.detectors import PLACED
-from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist, Value, implausible, read
 from coopenv.cars.messages.stated import stated
 from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.deployment import Deployment
@@ -92,7 +92,7 @@ class Assembler:
         self._inbox = NeighbourInbox(binding, self.refused)
 
     def put(self, sample: Sample) -> bool:
-        """Take a sample; return whether it is of a known car, not of the future, and newer than all before of it."""
+        """Take a sample; return whether it is of a known car, plausible, and newer than all before of it."""
         key = car, role = sample.car, sample.role
         why = ""
         if car not in self.binding.leaders and car not in self.binding.cars:
@@ -101,6 +101,8 @@ class Assembler:
             why = "stamp in the future"
         elif sample.stamp <= self._newest.get(key, -1):
             why = f"{KINDS.get(role, 'message')} out of order"
+        elif implausible(sample):
+            why = "velocity of no car"
         if why:
             self.refused[why] += 1
             return False
@@ -325,7 +327,7 @@ class Intake:
             message = decode(arrival.payload, self._profile.topics[role].type)
             stamp = stamp_of(message)
             vision, distorted = self._profile.vision, self._sensors.distorted
-            value = read(role, message, calibration, distorted=distorted, vision=vision)
+            value = read(role, message, calibration, distorted=distorted, vision=vision, any_unit=True)
         except CoopenvError:
             self.rejected[car][role.value] += 1
             return

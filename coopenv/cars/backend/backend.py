@@ -25,7 +25,7 @@ from coopenv.cars.link.connect import open_transport
 from coopenv.cars.link.keys import Signer, Verifier, load_keys
 from coopenv.cars.link.transport import Arrival, ReceivingTransport, Transport
 from coopenv.cars.messages.codec import encode, make, warm_up
-from coopenv.cars.messages.readings import Sample
+from coopenv.cars.messages.readings import Sample, implausible
 from coopenv.cars.messages.v2x import estimate_message, report_message
 from coopenv.cars.settings.deployment import Deployment, load_deployment
 from coopenv.cars.settings.profile import RESET_TOPIC, VELOCITY, Role, presence_of
@@ -235,7 +235,11 @@ class Svea:
             for sample in self.intake.samples(arrival):
                 if self._assembler.put(sample):
                     self.monitor.put(sample)
-                    self._streams.put(sample)
+                elif why := implausible(sample):
+                    self.monitor.odd[sample.car, sample.role] = why
+                else:
+                    continue
+                self._streams.put(sample)  # in whatever unit: the streams together show it
         self.monitor.looked = self.pacer.now()
 
     def _counted(self, tick: Sensed) -> Sensed:
@@ -412,7 +416,6 @@ def examined_arrivals(arrivals: Sequence[Arrival], fleet: Deployment) -> list[Fi
     binding = bind(scenario, fleet.cars, fleet.markers, fleet.file.name, None, fleet.profile)
     intake = Intake(binding, fleet.sensors)
     samples = [sample for arrival in arrivals for sample in intake.samples(arrival)]
-    samples.sort(key=lambda sample: sample.stamp)
     found = examined(samples, binding, fleet.sensors.trust, intake.lenses, constants=True)
     return [finding for some in found.values() for finding in some]
 

@@ -73,6 +73,8 @@ class LinkMonitor:
         """Choose the source of the judged positions: motion capture, or the cars' estimates."""
         self._judging = (Role.TRUTH,) if judge == "truth" else (Role.ESTIMATE, Role.REPORT, Role.POINT)
         self._known_at: dict[tuple[str, Role], int] = {}
+        self.odd: dict[tuple[str, Role], str] = {}
+        """Why the last velocity by car and role is no car's."""
         self.begin(0)
 
     def begin(self, now: int) -> None:
@@ -92,6 +94,7 @@ class LinkMonitor:
         # Motion capture has a clock of its own with an unknown delay.
         known_at = sample.received if sample.role is Role.TRUTH else min(sample.stamp, sample.received)
         self._known_at[sample.car, sample.role] = known_at
+        self.odd.pop((sample.car, sample.role), None)
         value = sample.value
         if sample.role in self._judging and isinstance(value, CarPose | Message) and value.position is not None:
             self.place(sample.car, value.position, known_at)
@@ -319,7 +322,8 @@ class Watchdog:
             ages = {"odometry": self.station.silence(topic), "usable new message": self.monitor.age(car, role)}
             for what, age in ages.items():
                 if age > self.safety.odometry_age:
-                    yield f"no {what} on {topic} {since(age)}"
+                    why = self.monitor.odd.get((car, role), "")
+                    yield f"no {what} on {topic} {since(age)}{f': {why} (another unit?)' if why else ''}"
 
     def misplaced(self) -> Iterator[tuple[str, str]]:
         """Yield cars with a position that violates a rule, and the violation in words.

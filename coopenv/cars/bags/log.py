@@ -29,7 +29,16 @@ from coopenv.cars.doctor.timing import of_timing
 from coopenv.cars.gate.wheel_command import read_drive
 from coopenv.cars.messages.codec import encode, stamp_of
 from coopenv.cars.messages.detectors import PLACED
-from coopenv.cars.messages.readings import OTHER_FIELDS, CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.messages.readings import (
+    OTHER_FIELDS,
+    CarPose,
+    Detections,
+    Sample,
+    Twist,
+    Value,
+    read,
+    without_outliers,
+)
 from coopenv.cars.messages.stated import stated
 from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.profile import Role
@@ -66,7 +75,8 @@ def value_reader(
         calibration = calibrations.get(entry.car)
         if entry.role is Role.MANUAL:
             return read_drive(encode(message), binding.profile.command)
-        value = known_already or read(entry.role, message, calibration, distorted=given.distorted, vision=given.vision)
+        settings: dict[str, Any] = {"distorted": given.distorted, "vision": given.vision, "any_unit": True}
+        value = known_already or read(entry.role, message, calibration, **settings)
         if isinstance(value, Detections) and (others := [m for m in value.markers if m not in known]):
             unknown.update(others)
             there = [m in known for m in value.markers]
@@ -140,6 +150,7 @@ def tracks_of(
     for track in tracks:
         if file.dated:
             track.date_undated()
+        track.entries = without_outliers(track.entries, track.refused)
         track.clean_stamps(clocks.mode)
     return tracks
 

@@ -129,7 +129,7 @@ def calibrate(drive: CalibrationDrive, truth: bool = True) -> Calibrated:
         raise DataError(f"{names}: the drive does not determine the poses ({error})") from None
 
 
-def corrected(batch: Batch, given: Fit, tried_most: int = TRIED, least: float = -np.inf) -> Fit:
+def corrected(batch: Batch, given: Fit, tried_most: int = TRIED, least: float = -np.inf, rounds: int = MOST) -> Fit:
     """Return the fit with the wrong constants corrected, from one with all as given.
 
     Args:
@@ -137,10 +137,11 @@ def corrected(batch: Batch, given: Fit, tried_most: int = TRIED, least: float = 
         given: fit with all constants as given.
         tried_most: hypotheses that are fitted in each round.
         least: linearised gain at which one is fitted.
+        rounds: hypotheses that may be wrong at the same time.
     """
     fit, groups = given, hypotheses(batch)
     penalty = 0.5 * log(sum(len(batch.times(c)) for c in range(len(batch.cars))))
-    for _ in range(MOST):
+    for _ in range(rounds):
         ranked = sorted(gains(batch, fit, groups, penalty), key=lambda entry: -entry[0])[:tried_most]
         ranked = [entry for entry in ranked if entry[0] >= least]
         tried = [batch.fit(replace(fit, free=fit.free | np.isin(np.arange(len(fit.x)), group))) for _, group in ranked]

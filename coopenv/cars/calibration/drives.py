@@ -74,7 +74,8 @@ def car_of(car: CarStreams, where: str, **more: Any) -> CarDrive:
     a step of the motion: while a car stands, pixels repeat the same rounding. Raises DataError: too few sightings.
     """
     pixel = np.zeros((len(car.ray), 2)) if car.lens is None else np.round(car.lens.pixels(car.ray), 3)
-    tracks = {key: value for key, value in car.tracks.items() if "command" not in key}
+    known = {field.name for field in fields(CarDrive)}
+    tracks = {key: value for key, value in car.tracks.items() if key in known}
     same = {field.name: getattr(car, field.name) for field in fields(CarSight)}
     return _of_use(CarDrive(pixel=pixel, **tracks, **same, **more), where)
 
@@ -169,6 +170,7 @@ def _of_vehicle(r: Recording, i: int, static: NDArray[np.int64]) -> CarStreams:
         "truth_time": r.t[known],
         "truth": place[:, 0] + 1j * place[:, 1],
         "truth_yaw": np.array([yaw_of(R) for R in r.truth.rotation[known, i]]),
+        "truth_pose": np.concatenate([r.truth.rotation[known, i], place[:, :, None]], axis=-1),
         **dict.fromkeys(("command_time", "command_speed", "command_steering"), none),
     }
     start = None if scenario is None else scenario.vehicles[i].initial_pose

@@ -8,7 +8,17 @@ import numpy as np
 
 from coopenv.base.errors import DataError
 from coopenv.cars.calibration.batch import Batch, Fit
-from coopenv.cars.calibration.calibrate import corrected, errors, exchanged, parts_of, row_of, unexplained, wrong
+from coopenv.cars.calibration.calibrate import (
+    INTRINSICS,
+    MOST,
+    corrected,
+    errors,
+    exchanged,
+    parts_of,
+    row_of,
+    unexplained,
+    wrong,
+)
 from coopenv.cars.calibration.drives import CalibrationDrive, CarDrive
 from coopenv.cars.doctor.finding import Finding, Treatment
 from coopenv.cars.doctor.motion import SPEED_FACTORS
@@ -16,6 +26,11 @@ from coopenv.cars.doctor.sight import BAD, MIRRORS, REMOVED, UNITS
 from coopenv.cars.messages.vision import rays
 
 ROUNDS = 3  # times that a cause is looked for without motion capture
+TOGETHER = 2
+"""Parts that may be wrong at the same time; more of them imitate a fault that is none of a constant."""
+ANY = "bearings contradict wheels and gyro, and no single cause explains it (gyro, wheels, map, markers or camera?)"
+TURNS, FINER = (0.5, 0.65, 0.8, 1.0, 1.2, 1.5, 2.0), (0.86, 0.9, 0.93, 0.97, 1.0, 1.03, 1.07, 1.1, 1.14)
+"""Scales of a gyro that are tried without motion capture, and multiples of the best one that are tried then."""
 TRIED = 2  # hypotheses that are fitted in a round
 GAIN = 5.0
 """Gain of the linearised cost from which a hypothesis is fitted: a third of the gain that calibration accepts."""
@@ -41,14 +56,26 @@ def of_constants(drive_of: Callable[[], CalibrationDrive]) -> Iterator[Finding]:
             drive, batch = changed, Batch(changed, True)
             yield finding
         given = batch.fit(batch.begin())
-        fit = corrected(batch, given, TRIED, GAIN)
+        fit = corrected(batch, given, TRIED, GAIN, TOGETHER + 1 if blind else MOST)
         if lines := [*unexplained(batch, fit)]:
             cause = next(_coarse(drive, name, 0.0), None) if blind else None
-            yield cause[0] if cause else Finding(name, lines[0].partition(": ")[2], car=name, explained=False)
+            text = lines[0].partition(": ")[2]
+            text = f"{ANY}: {text}" if blind else text
+            yield cause[0] if cause else Finding(name, text, car=name, explained=False)
             return
-        yield from _wrong(batch, fit, name)
+        found = [*_wrong(batch, fit, name)]
+        if blind and len({_group(each) for each in found}) > TOGETHER:
+            parts = ", ".join(each.subject.removeprefix(f"{name}: ") for each in found)
+            yield Finding(name, f"{ANY}; constants that would have to be wrong together: {parts}", car=name)
+        else:
+            yield from found
     except (DataError, np.linalg.LinAlgError):  # too short a drive, or one that determines no pose
         return
+
+
+def _group(finding: Finding) -> str:
+    """Return what a part with wrong constants belongs to; a lens is one thing."""
+    return INTRINSICS[0] if finding.subject.endswith(INTRINSICS) else finding.subject
 
 
 def thinned(car: CarDrive) -> CarDrive:
@@ -103,9 +130,22 @@ def _windows(drive: CalibrationDrive) -> float:
     return Batch(drive, False).resected(0, np.arange(len(drive.places)))[1]
 
 
+def _turning(drive: CalibrationDrive) -> float:
+    """Return the scale of turn rates with which bearings misfit least."""
+    (car,), best = drive.cars, 1.0
+    for scales in (TURNS, FINER):
+        tried = best * np.array(scales)
+        misfit = [_windows(replace(drive, cars=(replace(car, gyro=car.gyro / k),))) for k in tried]
+        best = float(tried[int(np.argmin(misfit))])
+    return best
+
+
 def _changes(drive: CalibrationDrive, car: CarDrive) -> Iterator[tuple[str, CarDrive, np.ndarray]]:
     """Yield causes, and the streams and the map without them."""
     places = drive.places
+    factor = _turning(drive)
+    text = f"the turn rate of {car.name} is about {factor:.2g} times that by bearings"
+    yield text, replace(car, gyro=car.gyro / factor), places
     for what, factor in SPEED_FACTORS.items():
         text = f"the velocity of {car.name} is {factor:.4g} times that by bearings ({what})"
         yield text, replace(car, wheel=car.wheel / factor), places

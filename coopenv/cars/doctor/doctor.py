@@ -16,12 +16,15 @@ import numpy as np
 from coopenv.cars.bags.clocks import CAMERAS
 from coopenv.cars.calibration.drives import CalibrationDrive
 from coopenv.cars.doctor.constants import of_constants
-from coopenv.cars.doctor.finding import Diagnosis, Finding, Treatment
+from coopenv.cars.doctor.conventions import of_conventions
+from coopenv.cars.doctor.finding import Diagnosis, Finding, Mend, Treatment
+from coopenv.cars.doctor.flips import of_flips
 from coopenv.cars.doctor.motion import of_frozen_streams, of_noise, of_turning, of_velocity, turns_contradict
 from coopenv.cars.doctor.sight import exchanged_bodies, of_sight
+from coopenv.cars.doctor.slip import of_slip
 from coopenv.cars.doctor.streams import MOVING, TURNING, CarStreams, Streams
 from coopenv.cars.doctor.turning import constant_turn_rate
-from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist
+from coopenv.cars.messages.readings import Detections, Sample, Twist
 from coopenv.cars.settings.profile import Role
 
 REMOVED = (Treatment.MENDED, Treatment.LEFT_OUT)
@@ -31,8 +34,6 @@ SHORT = 2.0
 """s up to which a contradiction refuses no drive."""
 ROUNDS = 6
 """Times that all checks look at a car."""
-Mend = Callable[[Sample], Sample | None]
-"""Returns a sample without a fault; None: it is left out."""
 Check = Callable[[CarStreams], Iterator[Diagnosis]]
 
 
@@ -87,7 +88,7 @@ def examine_cars(cars: Iterable[CarStreams], trusted: Collection[str] = ()) -> E
         diagnoses = diagnosed(car)
         found.cars[name] = changed(car, diagnoses)
         for each in diagnoses:
-            mend, finding = _mend_of(each.finding, car), treated(each.finding, trusted)
+            mend, finding = _mend_of(each, car), treated(each.finding, trusted)
             found.findings.append(finding)
             found.parts |= {*each.parts}
             if finding.treatment in REMOVED:
@@ -126,8 +127,8 @@ def _unnamed(car: CarStreams, named: Sequence[Diagnosis]) -> Iterator[list[Diagn
     """Yield what each check finds, but for what is named already, in the order in which faults hide each other."""
     known = {_words(each.finding) for each in named}
     unexplained = any(each.change is None and each.finding.subject == car.topic([Role.TRUTH]) for each in named)
-    checks: list[Check] = [_of_unmeasured, _of_constant_turning, of_frozen_streams]
-    checks += [*([] if unexplained else [of_sight]), partial(_of_motion, unexplained=unexplained)]
+    checks: list[Check] = [_of_unmeasured, of_flips, _of_constant_turning, of_frozen_streams]
+    checks += [*([] if unexplained else [of_conventions, of_sight]), partial(_of_motion, unexplained=unexplained)]
     for check in checks:
         if new := [each for each in check(car) if _words(each.finding) not in known]:
             yield new
@@ -157,35 +158,32 @@ def _of_constant_turning(car: CarStreams) -> Iterator[Diagnosis]:
 
 def _of_motion(car: CarStreams, unexplained: bool) -> Iterator[Diagnosis]:
     use_truth = not (unexplained and turns_contradict(car))
+    if use_truth and car.truth_signals is not None:
+        yield from of_slip(car, *car.truth_signals)
     if len(rates := car.tracks["gyro"]) and np.ptp(rates) > 0.0:
         yield from of_turning(car, use_truth)
     yield from of_velocity(car, use_truth)
 
 
-def _mend_of(finding: Finding, car: CarStreams) -> Mend:
-    """Return the change of samples that removes a finding that can be mended, or leaves out what repeats itself."""
-    key, _, value = finding.key.partition(" = ")
-    factor, last = float(value or 1.0) if key.endswith("_factor") else 1.0, [np.full(3, np.nan)]
+def _mend_of(diagnosis: Diagnosis, car: CarStreams) -> Mend:
+    """Return the change of a car's samples that removes a fault, by its key if it has no other."""
+    change = diagnosis.mend or partial(_by_key, diagnosis.finding.key)
+    return lambda sample: change(sample) if sample.car == car.name else sample
 
-    def mend(sample: Sample) -> Sample | None:
-        twist = sample.value
-        if sample.car != car.name:
-            return sample
-        if finding.treatment is Treatment.LEFT_OUT and sample.role is Role.TRUTH and isinstance(twist, CarPose):
-            same, last[0] = np.array_equal(twist.position, last[0]), twist.position
-            return None if same else sample
-        if not isinstance(twist, Twist):
-            return sample
-        if key.endswith("gyro_factor") and twist.angular is not None:
-            twist = replace(twist, angular=factor * twist.angular)
-        elif key.endswith("wheel_factor") and twist.linear is not None:
-            twist = replace(twist, linear=factor * twist.linear)
-        elif key and not value and twist.linear is not None and twist.pose is not None:
-            R = twist.pose.rotation
-            twist = twist if R is None else replace(twist, linear=R.T @ twist.linear)
-        return replace(sample, value=twist)
 
-    return mend
+def _by_key(given: str, sample: Sample) -> Sample:
+    """Return a sample with the factor of a key, or turned by its own pose."""
+    (key, _, value), twist = given.partition(" = "), sample.value
+    if not isinstance(twist, Twist):
+        return sample
+    if key.endswith("gyro_factor") and twist.angular is not None:
+        twist = replace(twist, angular=float(value) * twist.angular)
+    elif key.endswith("wheel_factor") and twist.linear is not None:
+        twist = replace(twist, linear=float(value) * twist.linear)
+    elif key and not value and twist.linear is not None and twist.pose is not None:
+        R = twist.pose.rotation
+        twist = twist if R is None else replace(twist, linear=R.T @ twist.linear)
+    return replace(sample, value=twist)
 
 
 def examine_constants(

@@ -7,6 +7,7 @@ from math import ceil, floor, inf, log10
 from typing import NamedTuple
 
 from coopenv.cars.doctor.streams import CarStreams
+from coopenv.cars.messages.readings import Sample
 
 
 class Treatment(Enum):
@@ -50,6 +51,10 @@ Change = Callable[[CarStreams], CarStreams]
 """Returns the streams of a car without a fault."""
 
 
+Mend = Callable[[Sample], Sample | None]
+"""Returns a sample of a car without a fault; None: it is left out."""
+
+
 class Diagnosis(NamedTuple):
     """A finding, and the change with which the examination looks for what it hides, whatever its treatment."""
 
@@ -58,6 +63,8 @@ class Diagnosis(NamedTuple):
     """None: nothing is known that removes it."""
     parts: tuple[str, ...] = ()
     """Constants that the change has estimated, by the titles of a calibration."""
+    mend: Mend | None = None
+    """None: that of the finding's key."""
 
 
 def with_error(value: float, error: float) -> str:

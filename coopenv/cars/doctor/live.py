@@ -1,6 +1,6 @@
 """The gate for live cars: the same checks, on a window of the last samples."""
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -13,7 +13,7 @@ from coopenv.cars.doctor.doctor import REMOVED, examine, examine_constants
 from coopenv.cars.doctor.finding import Finding, Treatment
 from coopenv.cars.doctor.streams import CarStreams, Streams
 from coopenv.cars.doctor.turning import constant_turn_rate
-from coopenv.cars.messages.readings import Sample, Twist
+from coopenv.cars.messages.readings import Sample, Twist, without_outliers
 from coopenv.cars.messages.vision import Calibration
 from coopenv.cars.settings.profile import Role
 
@@ -86,7 +86,7 @@ class StreamMonitor:
         return [finding for some in found.values() for finding in some if finding.treatment is Treatment.USED]
 
     def _samples(self) -> list[Sample]:
-        return sorted((s for kept in self._kept.values() for s in kept), key=lambda sample: sample.stamp)
+        return [sample for kept in self._kept.values() for sample in kept]
 
 
 def examined(
@@ -105,13 +105,15 @@ def examined(
     alike, so that cars that have stood are left out.
 
     Args:
-        samples: in the order of their stamps.
+        samples: those of a topic in the order of their reception.
         binding: of the fleet.
         trusted: subjects of findings that do not count.
         lenses: of the cameras of cars.
         constants: whether wrong constants are looked for, too.
     """
     roles = {(s.car, s.role) for s in samples if s.role in binding.profile.topics}
+    by_topic = [[s for s in samples if (s.car, s.role) == key] for key in {(s.car, s.role) for s in samples}]
+    samples = sorted((s for own in by_topic for s in without_outliers(own, Counter())), key=lambda s: s.stamp)
     topics = {(car, role): binding.profile.topic_of(car, role) for car, role in roles}
     streams = Streams(samples, binding, topics, lenses or {})
     found = examine(streams, trusted, moved)

@@ -3,16 +3,17 @@
 import math
 from collections.abc import Callable, Iterator
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.cars.bags.clocks import SampledSignal, turn_of
-from coopenv.cars.doctor.finding import Change, Diagnosis, Finding, Treatment, with_error
-from coopenv.cars.doctor.relation import Relation, intervals, relation
+from coopenv.cars.doctor.finding import Change, Diagnosis, Finding, Mend, Treatment, with_error
+from coopenv.cars.doctor.relation import INTERVAL, Relation, intervals, relation
 from coopenv.cars.doctor.streams import MOVING, TURNING, CarStreams
 from coopenv.cars.doctor.turning import TURNED
+from coopenv.cars.messages.readings import CarPose, Sample
 from coopenv.cars.settings.profile import Role
 from coopenv.estimation.poses import Array
 
@@ -27,6 +28,7 @@ FACTORS = {
 SPEED_FACTORS = {
     "the other sign": -1.0,
     "km/h instead of m/s": 3.6,
+    "mph instead of m/s": 2.23694,
     "mm/s instead of m/s": 1000.0,
     "cm/s instead of m/s": 100.0,
     "m/s taken for km/h": 1.0 / 3.6,
@@ -48,6 +50,8 @@ SURE, LAGS = 0.9, (*np.arange(-1.0, 0.0, 0.1), *np.arange(0.1, 1.05, 0.1))
 """Share of the variance from which no other lag is tried, and lags, s."""
 IN_THE_ROOM = "is in the frame of"
 """Words of a velocity that is not in the body's frame."""
+TURNING_WHEEL, RPM = 2.0, 30.0 / math.pi
+"""Factor from which speeds may be a wheel's turn rates, and rpm of 1 rad/s."""
 LEAST = 0.05
 """Practical size: a scale by which 20 s of driving at 0.3 m/s are 0.3 m off without bearings."""
 
@@ -72,8 +76,8 @@ def turning_factor(car: CarStreams, heading: SampledSignal, axis: int = 2) -> Re
 
 def named(factor: float, factors: dict[str, float], within: float = NAMED) -> tuple[str, float] | None:
     """Return the name of a factor and its exact value, from which it may differ by a share; None: it has none."""
-    close = [(name, value) for name, value in factors.items() if abs(factor / value - 1.0) < within]
-    return close[0] if close else None
+    name, value = min(factors.items(), key=lambda entry: abs(factor / entry[1] - 1.0))
+    return (name, value) if abs(factor / value - 1.0) < within else None
 
 
 def of_turning(car: CarStreams, use_truth: bool) -> Iterator[Diagnosis]:
@@ -157,31 +161,51 @@ def velocity_relations(
 
     A turn about another point on the axis of the car moves the body to the side, too, and is fitted with it.
     """
+    found = displacements(car, place, heading)
+    if found is None:
+        return None, None
+    begin, body, driven, turn, middle = found
+
+    def moved(lag: float) -> NDArray[np.complex128]:
+        measured = SampledSignal.of_rates(car.tracks["wheel_time"], car.tracks["wheel"])
+        return _planar(measured.over(begin + lag, begin + INTERVAL + lag))
+
+    return (
+        at_best(lambda lag: relation(begin, driven(lag), body, 2j * np.sin(0.5 * turn))),
+        at_best(lambda lag: relation(begin, moved(lag), body * np.exp(1j * middle))),
+    )
+
+
+class Displacements(NamedTuple):
+    """Motion over intervals by a path, and by measured velocities."""
+
+    begin: Array  # (n,) s
+    body: NDArray[np.complex128]
+    """(n,) by the path, about the heading in the middle, m."""
+    driven: Callable[[float], NDArray[np.complex128]]
+    """Returns chords (n,) of the measured arcs with stamps that are late, s."""
+    turn: Array  # (n,) rad
+    middle: Array  # (n,) heading in the middle, rad
+
+
+def displacements(car: CarStreams, place: SampledSignal, heading: SampledSignal) -> Displacements | None:
+    """Return the motion over intervals by a path and by the wheels; None: too little."""
     time, velocity = car.tracks["wheel_time"], car.tracks["wheel"]
     if len(time) < 2:
-        return None, None
-    measured = SampledSignal.of_rates(time, velocity)
-    begin, end = intervals(measured, place, heading)
+        return None
+    begin, end = intervals(SampledSignal.of_rates(time, velocity), place, heading)
     middle, turn = heading.over(begin, 0.5 * (begin + end), level=True)[:, 0], heading.over(begin, end)[:, 0]
     true = _planar(place.over(begin, end))
     known = np.isfinite(true)
     if not known.any() or float(np.sqrt(np.mean(np.abs(true[known]) ** 2))) < MOVES:
-        return None, None
-    body = true * np.exp(-1j * middle)
+        return None
 
     def driven(lag: float) -> NDArray[np.complex128]:
-        """Return the chords (n,) of the measured arcs, about the heading in their middle."""
         yaw = np.interp(time - lag, heading.times, heading.values[:, 0])
         arc = SampledSignal.of_rates(time, velocity * np.exp(1j * yaw)).over(begin + lag, end + lag)
         return np.asarray(_planar(arc) * np.exp(-1j * middle))
 
-    def moved(lag: float) -> NDArray[np.complex128]:
-        return _planar(measured.over(begin + lag, end + lag))
-
-    return (
-        at_best(lambda lag: relation(begin, driven(lag), body, 2j * np.sin(0.5 * turn))),
-        at_best(lambda lag: relation(begin, moved(lag), true)),
-    )
+    return Displacements(begin, true * np.exp(-1j * middle), driven, turn, middle)
 
 
 def at_best(related: Callable[[float], Relation | None]) -> Relation | None:
@@ -268,6 +292,8 @@ def _velocity(car: CarStreams, topic: str, what: str, body: Relation) -> Diagnos
     treatment = Treatment.REFUSED if abs(size - 1.0) > 0.3 else Treatment.USED
     if known is not None:
         text, treatment = f"{text} ({known[0]})", Treatment.MENDED
+    elif size > TURNING_WHEEL:
+        text += f" (of a wheel with a radius of {1.0 / size:.2g} m in rad/s, or of {RPM / size:.2g} m in rpm?)"
     parts = (f"{car.name}: wheel scale",) if known is None else ()
     return Diagnosis(Finding(topic, text, signed, body.error, key, treatment, car.name), moved_by(1.0 / exact), parts)
 
@@ -351,14 +377,25 @@ def _frozen_truth(car: CarStreams) -> Iterator[Diagnosis]:
             text = f"motion capture repeats one pose of {car.name} for {end - begin:.1f} s, in which "
             text += f"its wheels move it by {way:.2f} m"
             about = Finding(car.topic([Role.TRUTH]), text, way, None, "", Treatment.LEFT_OUT, car.name)
-            yield Diagnosis(about, _without_repeated_poses)
+            yield Diagnosis(about, _without_repeated_poses, mend=_unlike_the_last())
 
 
 def _without_repeated_poses(car: CarStreams) -> CarStreams:
     """Return a car without poses of motion capture that equal those before them."""
-    place = car.tracks["truth"]
-    kept = np.append(True, np.diff(place) != 0.0)
-    return car.with_tracks(**{name: car.tracks[name][kept] for name in ("truth_time", "truth", "truth_yaw")})
+    return car.with_truth_of(np.append(True, np.diff(car.tracks["truth"]) != 0.0))
+
+
+def _unlike_the_last() -> Mend:
+    """Return a mend that leaves out messages of motion capture with the place of the one before."""
+    last = [np.full(3, np.nan)]
+
+    def mend(sample: Sample) -> Sample | None:
+        if sample.role is not Role.TRUTH or not isinstance(sample.value, CarPose):
+            return sample
+        same, last[0] = np.array_equal(sample.value.position, last[0]), sample.value.position
+        return None if same else sample
+
+    return mend
 
 
 def frozen(time: Array, values: NDArray[Any]) -> Iterator[tuple[float, float, int]]:

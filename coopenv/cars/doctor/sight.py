@@ -21,7 +21,7 @@ from coopenv.cars.calibration.drives import LEAST_SECONDS
 from coopenv.cars.calibration.resection import misfits, seen_from
 from coopenv.cars.doctor.finding import Change, Diagnosis, Finding, Treatment, with_error
 from coopenv.cars.doctor.motion import NAMED, turning_factor, velocity_relations
-from coopenv.cars.doctor.streams import CarStreams, Planar
+from coopenv.cars.doctor.streams import OF_TRUTH, CarStreams, Planar
 from coopenv.cars.messages.vision import Calibration, rays
 from coopenv.cars.settings.profile import Role
 from coopenv.estimation.lens import distort
@@ -412,9 +412,9 @@ def _far(car: CarStreams, sight: PosedSightings) -> str:
 
 def exchanged_bodies(one: CarStreams, other: CarStreams) -> list[CarStreams]:
     """Return two cars with each other's motion capture, if bearings of both misfit and fit with that; or none."""
-    names, given = ("truth_time", "truth", "truth_yaw"), [thinned(one), thinned(other)]
+    given = [thinned(one), thinned(other)]
     if not all(car is not None and sight_of(car).misfit() > BAD for car in given):
         return []
-    right = [a.with_tracks(**{name: b.tracks[name] for name in names}) for a, b in ((one, other), (other, one))]
+    right = [a.with_tracks(**{name: b.tracks[name] for name in OF_TRUTH}) for a, b in ((one, other), (other, one))]
     fitting = [thinned(car) for car in right]
     return right if all(car is not None and sight_of(car).misfit() < BAD for car in fitting) else []

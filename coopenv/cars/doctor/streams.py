@@ -124,6 +124,15 @@ class CarStreams(CarSight):
         turning[:, 2] = values
         return replace(self.with_tracks(gyro=values), turning=turning)
 
+    def with_poses(self, pose: Array) -> Self:
+        """Return the streams with other poses (n, 3, 4) of motion capture: rotations beside positions."""
+        place, yaw = pose[:, 0, 3] + 1j * pose[:, 1, 3], np.arctan2(pose[:, 1, 0], pose[:, 0, 0])
+        return self.with_tracks(truth_pose=pose, truth=place, truth_yaw=yaw)
+
+    def with_truth_of(self, rows: Any) -> Self:
+        """Return the streams with some messages of motion capture, by an index of them."""
+        return self.with_tracks(**{name: self.tracks[name][rows] for name in OF_TRUTH if name in self.tracks})
+
     def shifted(self, role: Role, seconds: float) -> Self:
         """Return the streams with a time added to the stamps of a role."""
         if role in CAMERAS:
@@ -131,6 +140,8 @@ class CarStreams(CarSight):
         return self.with_tracks(**{n: self.tracks[n] + seconds for n in ROLES_OF if self.is_of(n, role)})
 
 
+OF_TRUTH = ("truth_time", "truth", "truth_yaw", "truth_pose")
+"""Tracks of motion capture."""
 ROLES_OF = {"wheel_time": MOVING, "gyro_time": TURNING, "truth_time": (Role.TRUTH,)}
 """Roles of the times of tracks."""
 

@@ -4,6 +4,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coopenv.cars.bags.clocks import CAMERAS, NO_CRYSTAL, Times
 from coopenv.cars.bags.topic_map import COMMANDS, UNNEEDED
@@ -18,12 +19,16 @@ from coopenv.cars.settings.profile import Role
 NS = 1e-9
 OUTAGE, PERIODS, OFTEN = 1.5, 20.0, 4.0
 """s, and periods of the topic, of a silence that is stated, and periods of one that may come more often."""
+FEWEST, LOST, STEADY, NEAR, QUARTER = 50, 0.2, 0.9, 0.2, 0.25
+"""Intervals at least; share of lost messages above which that is stated, and of the intervals that are whole numbers of
+periods, up to a share of one; share of the intervals that are a single period."""
 FEW, SHARE = 5, 0.02
 """Messages, and their share, that come twice, above which that is stated."""
 REPEATED = 0.2
 """Share of equal values in a row above which a stream repeats itself, of values with noise."""
-HELD, LENGTHS = 0.9, (2, 3, 4, 5, 6)
-"""Share of the runs of equal frames with a multiple of a length above which a camera holds them, and lengths."""
+HELD, FREE, LENGTHS, BLOCK = 0.95, 0.4, (2, 3, 4, 5, 6), 60
+"""Share of equal frames at a place of a pattern at least, and at another one at most, with which a camera holds them;
+lengths of patterns; frames in which these do not shift, as they do after a frame that is lost."""
 LATE = 0.25
 """s by which a twentieth of the messages come later than the earliest: a network buffers them."""
 
@@ -51,6 +56,24 @@ def _markers(sample: Sample) -> bool:
     return isinstance(sample.value, Detections) and bool(sample.value.markers)
 
 
+def of_losses(samples: Sequence[Sample], topic: str) -> Iterator[Finding]:
+    """Yield that single messages of a topic with a steady period are lost again and again.
+
+    Cameras that send nothing without a marker in view are often silent, and by right.
+    """
+    steps = np.diff([sample.stamp for sample in samples]) * NS
+    if len(steps) < FEWEST or (samples[0].role in CAMERAS and all(map(_markers, samples))):
+        return
+    period = float(np.median(steps[steps <= np.quantile(steps, QUARTER)]))
+    steps = steps[steps < PERIODS * period]
+    count = np.rint(steps / max(period, NS))
+    whole, lost = np.abs(steps - count * period) < NEAR * period, int(np.maximum(count - 1.0, 0.0).sum())
+    share = lost / (lost + len(samples))
+    if share > LOST and whole.mean() > STEADY and (count > 1.0).sum() > 2 * FEW:
+        text = f"{lost} messages are lost here and there, {share:.0%}: intervals are multiples of {1e3 * period:.3g} ms"
+        yield Finding(topic, text, share, car=samples[0].car)
+
+
 def of_duplicates(samples: Sequence[Sample], topic: str) -> Iterator[Finding]:
     """Yield that messages have the stamp of an earlier one; a stamp of 0 is none."""
     first: dict[int, list[float]] = {}
@@ -73,15 +96,30 @@ def of_repeats(samples: Sequence[Sample], topic: str) -> Iterator[Finding]:
         return
     values = [some for sample in samples if (some := _numbers(sample))]  # but frames without any marker
     same = np.array([one == other for one, other in pairwise(values)], bool)
-    count, runs = int(same.sum()), np.diff(np.flatnonzero(~same))
-    if samples[0].role in CAMERAS:  # whole pixels of a slow car repeat themselves, too
-        repeats = len(runs) > 2 * FEW and any((runs % n == 0).mean() > HELD for n in LENGTHS)
+    if samples[0].role in CAMERAS:
+        count, repeats = int(same.sum()), _are_held(same)
     else:
         alone = same & ~np.append(same[1:], False) & ~np.append(False, same[:-1])  # not of a stream that sticks
         count, repeats = int(alone.sum()), alone.mean() > REPEATED
     if repeats:
         text = f"{count} of {len(samples)} messages are duplicates: they repeat the value of the one before"
         yield Finding(topic, text, count, car=samples[0].car)
+
+
+def _are_held(same: NDArray[np.bool_]) -> bool:
+    """Return whether frames repeat themselves (n,) in a pattern of so many frames, as those that a camera holds.
+
+    Whole pixels of a slow car repeat themselves, too, at any place of a pattern.
+    """
+    found = []
+    for begin in range(0, len(same) - BLOCK + 1, BLOCK):
+        block = same[begin : begin + BLOCK]
+        held = False
+        for length in LENGTHS:
+            share = np.array([block[k::length].mean() for k in range(length)])
+            held |= bool(share.max() >= HELD and share.min() <= FREE)
+        found.append(held)
+    return len(found) > 2 and float(np.mean(found)) > 0.5
 
 
 def _numbers(sample: Sample) -> list[float]:
@@ -172,6 +210,7 @@ def _of_topics(
         if entry.role in COMMANDS or entry.topic in left_out:
             continue
         yield from of_outages(own, entry.topic, min(needed), max(needed))
+        yield from of_losses(own, entry.topic)
         yield from of_repeats(own, entry.topic)
         streams = examined.cars.get(entry.car) if entry.role in MOVING else None
         paths = None if streams is None else streams.truth_signals or streams.own_signals

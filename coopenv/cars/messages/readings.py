@@ -1,6 +1,7 @@
 """Decoded messages as checked values in this project's conventions, from ROS 1 or ROS 2."""
 
 import math
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -226,6 +227,10 @@ OTHER_FIELDS = (ArithmeticError, AttributeError, LookupError, TypeError, ValueEr
 
 FARTHEST, FASTEST, SPINNING = 1e7, 200.0, 100.0
 """m, m/s and rad/s beyond which a value is no car's."""
+ABSURD = 1e6
+"""Speeds and turn rates beyond which a value is none, in whatever unit."""
+COMMON = 0.02
+"""Share of a topic's messages beyond what a car does from which they are in another unit, and no outliers."""
 
 
 def read(
@@ -236,6 +241,7 @@ def read(
     distorted: bool = True,
     known: Collection[int] | None = None,
     vision: VisionSettings = PLAIN,
+    any_unit: bool = False,
 ) -> Value:
     """Return the value of a message.
 
@@ -246,6 +252,7 @@ def read(
         distorted: `bearings` were computed from distorted pixels.
         known: markers that there are; detections of others are dropped and counted (None: all count).
         vision: markers in the frames of a camera.
+        any_unit: a velocity may be in another unit than m/s and rad/s; see `implausible`.
 
     Raises:
         CoopenvError: one line that names the role and the field: a type that the role has not, a value that is not
@@ -259,7 +266,10 @@ def read(
         if role is Role.CAMERA_INFO:
             return calibration_of(message, vision.rectified)
         if role not in (Role.DETECTIONS, Role.BEARINGS):
-            return readers[kind](message)
+            value = readers[kind](message)
+            if not any_unit and (why := implausible(Sample("", role, 0, 0, value))):
+                raise CoopenvError(why)
+            return value
         needed = kind not in PLACED and (role is Role.DETECTIONS or distorted)
         if needed and calibration is None:
             raise CoopenvError("the camera's calibration is not known")
@@ -269,6 +279,28 @@ def read(
         raise CoopenvError(f"{role}: {error}") from None
     except OTHER_FIELDS as error:
         raise CoopenvError(f"{role}: {kind} has other fields than expected ({error})") from None
+
+
+def implausible(sample: Sample) -> str:
+    """Return in words why a velocity is no car's in m/s and rad/s; empty: it may be one, or is none."""
+    value, turning = sample.value, "angular_velocity" if sample.role is Role.IMU else "twist.angular"
+    if isinstance(value, Twist):
+        for field, part, most in (("twist.linear", value.linear, FASTEST), (turning, value.angular, SPINNING)):
+            if part is not None and not (np.abs(part) <= most).all():
+                return f"{field}: {shown(part.tolist())} is not finite, or beyond {most:g}"
+    return ""
+
+
+def without_outliers(samples: Sequence[Sample], refused: Counter[str]) -> list[Sample]:
+    """Return the samples of a topic without velocities that are no car's, which are counted by reason.
+
+    If they are common, the topic is in another unit, which the doctor names: all samples are returned.
+    """
+    why = [implausible(sample) for sample in samples]
+    if sum(map(bool, why)) > COMMON * len(samples):
+        return [*samples]
+    refused.update(f"{sample.role}: {text}" for sample, text in zip(samples, why, strict=True) if text)
+    return [sample for sample, text in zip(samples, why, strict=True) if not text]
 
 
 def _twist(twist: Any) -> Twist:
@@ -291,8 +323,8 @@ def _velocities(twist: Any) -> Twist:
     """Return velocities, in which what is not finite is not measured: a turn rate is unknown, the others are 0."""
     linear, angular = ([part.x, part.y, part.z] for part in (twist.linear, twist.angular))
     linear[1:], angular[:2] = ([v if math.isfinite(v) else 0.0 for v in some] for some in (linear[1:], angular[:2]))
-    known = None if math.isnan(angular[2]) else numbers_of(angular, "twist.angular", SPINNING)
-    return Twist(numbers_of(linear, "twist.linear", FASTEST), known)
+    known = None if math.isnan(angular[2]) else numbers_of(angular, "twist.angular", ABSURD)
+    return Twist(numbers_of(linear, "twist.linear", ABSURD), known)
 
 
 def _turning(message: Any) -> Twist:
@@ -301,7 +333,7 @@ def _turning(message: Any) -> Twist:
         return Twist(None, None)
     turning = message.angular_velocity
     across = [0.0 if math.isnan(value) else value for value in (turning.x, turning.y)]  # as of one axis alone
-    return Twist(None, numbers_of([*across, turning.z], "angular_velocity", SPINNING))
+    return Twist(None, numbers_of([*across, turning.z], "angular_velocity", ABSURD))
 
 
 def _pose_with_covariance(pose: Any) -> CarPose:
@@ -389,7 +421,7 @@ def check_types(profile: CarProfile, where: str) -> None:
 
 
 TRACKS = (
-    *("wheel_time", "wheel", "gyro_time", "gyro", "truth_time", "truth", "truth_yaw"),
+    *("wheel_time", "wheel", "gyro_time", "gyro", "truth_time", "truth", "truth_yaw", "truth_pose"),
     *("command_time", "command_speed", "command_steering"),
 )
 
@@ -397,7 +429,8 @@ TRACKS = (
 def tracks_of(samples: Sequence[Sample], start: int) -> dict[str, Any]:
     """Return measurements of wheels, gyro and motion capture, and commands, as arrays by the names of `TRACKS`.
 
-    Times are in s since a start, ns; velocities (m/s, body) and places (m, map) are complex numbers x + iy.
+    Times are in s since a start, ns; velocities (m/s, body) and places (m, map) are complex numbers x + iy. Poses of
+    motion capture are (n, 3, 4): rotations beside positions.
     """
     wheel, gyro, truth, command = [], [], [], []
     for s in samples:
@@ -406,10 +439,10 @@ def tracks_of(samples: Sequence[Sample], start: int) -> dict[str, Any]:
             wheel += [] if value.linear is None else [(t, complex(*value.linear[:2]))]
             gyro += [] if value.angular is None else [(t, value.angular[2])]
         elif isinstance(value, CarPose) and value.rotation is not None and s.role is Role.TRUTH:
-            truth.append((t, complex(*value.position[:2]), yaw_of(value.rotation)))
+            truth.append((t, complex(*value.position[:2]), yaw_of(value.rotation), pose_of(value)))
         elif isinstance(value, MotionCommand):
             command.append((t, value.speed, value.steering))
-    columns = [*_columns(wheel, 2), *_columns(gyro, 2), *_columns(truth, 3), *_columns(command, 3)]
+    columns = [*_columns(wheel, 2), *_columns(gyro, 2), *_columns(truth, 4), *_columns(command, 3)]
     tracks = dict(zip(TRACKS, columns, strict=True))
     return tracks | {key: tracks[key].real for key in tracks if key not in ("wheel", "truth")}
 
@@ -432,6 +465,12 @@ def sightings_of(
 def yaw_of(rotation: Array) -> float:
     """Return the heading of a rotation (3, 3), rad."""
     return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+
+def pose_of(value: CarPose) -> Array:
+    """Return the rotation beside the position (3, 4) of a pose that has both."""
+    assert value.rotation is not None
+    return np.column_stack([value.rotation, value.position])
 
 
 def _columns(rows: Sequence[Any], count: int) -> list[Any]:

@@ -280,6 +280,15 @@ def test_messages_of_a_moving_landmark_count_once_and_expire() -> None:
     np.testing.assert_allclose(lost.landmarks[2], [3.0, 2.0, 0.0])  # not where it would be if it had gone on
 
 
+def test_a_velocity_of_no_car_moves_none() -> None:
+    assembler = begun(binding())
+    for k, speed in ((1, 1.0), (2, 400.0)):
+        twist = Twist(np.array([speed, 0.0, 0.0]), np.zeros(3))
+        assert assembler.put(sample(Role.ODOMETRY, START + k * MS, twist)) == (speed == 1.0)
+    assert assembler.refused["velocity of no car"] == 1
+    assert assembler.tick(1, START + 20 * MS).velocity[0, 0] == 1.0
+
+
 def test_samples_left_out_by_queues_are_counted() -> None:
     assembler = Assembler(binding())
     ray = Detections((1,), AHEAD)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from coopenv.cars.backend.binding import Binding, bind
 from coopenv.cars.bags.clocks import SampledSignal
@@ -115,6 +116,37 @@ def pose(place: Callable[[np.ndarray], np.ndarray], heading: Callable[[float], f
     return change
 
 
+def whole_pose(convention: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> Change:
+    """Rotations and positions as another convention states them."""
+
+    def change(value: Any, _: float) -> Any:
+        if not isinstance(value, CarPose) or value.rotation is None:
+            return value
+        rotation, position = convention(value.rotation, value.position)
+        return CarPose(position, rotation)
+
+    return change
+
+
+def scalar_first(R: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    x, y, z, w = Rotation.from_matrix(R).as_quat()
+    return Rotation.from_quat([w, x, y, z]).as_matrix(), p
+
+
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def flipping(value: Any, t: float) -> Any:
+    """Every twentieth pose has its heading turned by 180 deg."""
+    if not isinstance(value, CarPose) or value.rotation is None or round(50.0 * t) % 20:
+        return value
+    return CarPose(value.position, value.rotation @ turn(np.pi))
+
+
+def slipping(value: Any, t: float) -> Any:
+    return twist(linear=2.0)(value, t) if 8.0 < t < 12.0 else value
+
+
 def seen(ray: Callable[[np.ndarray], np.ndarray], number: Callable[[int], int] = int) -> Change:
     def change(value: Any, _: float) -> Any:
         if not isinstance(value, Detections):
@@ -162,6 +194,13 @@ FAULTS: dict[str, tuple[Change, str, Treatment | None]] = {
     "gyro with other axes": (axes, "turns about the x axis", Treatment.REFUSED),
     "wheels reversed": (twist(linear=-1.0), "velocity of car .* other sign", Treatment.MENDED),
     "wheels in km/h": (twist(linear=3.6), "velocity of car .*km/h instead of m/s", Treatment.MENDED),
+    "wheels in mph": (twist(linear=2.237), "velocity of car .*mph instead of m/s", Treatment.MENDED),
+    "wheels in mm/s": (twist(linear=1000.0), "velocity of car .*mm/s instead of m/s", Treatment.MENDED),
+    "wheels in rpm": (
+        twist(linear=9.549 / 0.05),
+        r"velocity of car is 19\d\(?\d?.* in rad/s, or of 0.0[45]\d? m in rpm",
+        Treatment.REFUSED,
+    ),
     "wheels end": (twist(linear=0.0, after=12.0), "velocity of car is 0 m/s in a row", Treatment.REFUSED),
     "truth in mm": (pose(lambda p: 1000.0 * p, float), "motion capture of car.* it is in mm", Treatment.USED),
     "truth mirrored": (pose(lambda p: p * [1, -1, 1], lambda a: -a), "motion capture .* mirrored", Treatment.USED),
@@ -176,6 +215,34 @@ FAULTS: dict[str, tuple[Change, str, Treatment | None]] = {
         Treatment.USED,
     ),
     "body of truth turned": (pose(same, lambda a: a + np.pi / 2), "its body is turned by 90 deg", Treatment.USED),
+    "quaternions with the scalar first": (
+        whole_pose(scalar_first),
+        r"motion capture .*order w, x, y, z.*bearings, turn rates, velocities agree",
+        Treatment.REFUSED,
+    ),
+    "the y axis is up": (
+        whole_pose(lambda R, p: (Y_UP @ R @ Y_UP.T, Y_UP @ p)),
+        "its axis y is up. With",
+        Treatment.REFUSED,
+    ),
+    "the y axis of the room is up": (
+        whole_pose(lambda R, p: (Y_UP @ R, Y_UP @ p)),
+        "its axis y is up. With",
+        Treatment.REFUSED,
+    ),
+    "inverse poses": (whole_pose(lambda R, p: (R.T, -R.T @ p)), "its poses are inverse", Treatment.REFUSED),
+    "poses of the camera": (
+        whole_pose(lambda R, p: (R @ AHEAD, p + R @ LEVER)),
+        "poses are those of the camera's optical frame",
+        Treatment.REFUSED,
+    ),
+    "positions of the camera": (
+        whole_pose(lambda R, p: (R, p + R @ LEVER)),
+        "its positions are those of the camera",
+        Treatment.REFUSED,
+    ),
+    "truth flips": (flipping, r"flips to another heading .* in 60 of 1200 poses, 5.0%", Treatment.LEFT_OUT),
+    "wheels slip": (slipping, r"slips for \d\.\d s, 1\d% of the drive, from [78]\.\d to 12\.\d s", Treatment.USED),
     "truth stuck": (stuck, r"repeats one pose of car for 6\.0 s", Treatment.LEFT_OUT),
     "image mirrored": (seen(lambda ray: ray * [-1, 1, 1]), "its image is mirrored", Treatment.REFUSED),
     "twice the focal length": (seen(narrow(2.0)), r"focal length is (2\.0|1\.9)\d*\(\d+\) times", Treatment.REFUSED),
@@ -228,6 +295,41 @@ def test_a_fault_is_named_by_its_cause(name: str) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_sound_drive_is_silent(truth: bool, seed: int) -> None:
     assert not [str(finding) for finding in findings_of(streams_of(None, truth, seed))]
+
+
+def test_flipped_poses_are_left_out_and_no_other() -> None:
+    streams = streams_of(FAULTS["truth flips"][0])
+    mended = [s for s in examine(streams).mended(streams.samples) if s.role is Role.TRUTH]
+    right = {s.stamp: s.value.rotation for s in driven() if s.role is Role.TRUTH}
+    assert len(mended) == len(right) - 60
+    assert all(np.array_equal(s.value.rotation, right[s.stamp]) for s in mended)
+
+
+def test_a_body_that_jumps_once_does_not_flip() -> None:
+    def change(value: Any, t: float) -> Any:
+        return FAULTS["body of truth turned"][0](value, t) if t > 12.0 else value
+
+    assert not any("flips" in str(finding) for finding in findings_of(streams_of(change)))
+
+
+def test_without_motion_capture_a_scale_of_turn_rates_is_named_and_no_camera() -> None:
+    [found] = findings_of(streams_of(twist(angular=1.4), truth=False))
+    assert re.search(r"turn rate of car is about 1\.[345]\d? times that by bearings", str(found))
+
+
+def unsigned(value: Any, _: float) -> Any:
+    return replace(value, angular=np.abs(value.angular)) if getattr(value, "angular", None) is not None else value
+
+
+ELSEWHERE = np.random.default_rng(0).uniform(-2.5, 2.5, PLACES.shape) * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.3]
+
+
+@pytest.mark.parametrize(("change", "places"), [(unsigned, PLACES), (None, ELSEWHERE)])
+def test_without_motion_capture_a_fault_of_no_constant_is_one_finding_with_alternatives(
+    change: Change | None, places: np.ndarray
+) -> None:
+    [found] = findings_of(streams_of(change, truth=False, places=places))
+    assert "(gyro, wheels, map, markers or camera?)" in str(found)
 
 
 BLIND = ("gyro reversed", "gyro in degrees", "gyro is zero", "wheels reversed", "wheels in km/h", "markers exchanged")
@@ -613,6 +715,10 @@ def test_recordings_go_through_the_same_checks() -> None:
     ("change", "words", "treatment"),
     [
         (FAULTS["wheels in km/h"][0], "km/h instead of m/s", Treatment.REFUSED),
+        (FAULTS["wheels in mm/s"][0], "mm/s instead of m/s", Treatment.REFUSED),
+        (FAULTS["inverse poses"][0], "its poses are inverse", Treatment.REFUSED),
+        (FAULTS["truth flips"][0], "flips to another heading", Treatment.REFUSED),
+        (FAULTS["wheels slip"][0], "slips for", Treatment.USED),
         (FAULTS["truth mirrored"][0], "it is mirrored", Treatment.REFUSED),
         (FAULTS["image mirrored"][0], "its image is mirrored", Treatment.REFUSED),
         (twist(linear=1.15), r"velocity of car is 1\.1[67]", Treatment.USED),

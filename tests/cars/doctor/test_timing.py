@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coopenv.cars.doctor.finding import Treatment
-from coopenv.cars.doctor.timing import of_delays, of_drift, of_duplicates, of_frames, of_outages, of_repeats
+from coopenv.cars.doctor.timing import of_delays, of_drift, of_duplicates, of_frames, of_losses, of_outages, of_repeats
 from coopenv.cars.messages.readings import CarPose, Detections, Sample, Twist
 from coopenv.cars.messages.stated import Stated
 from coopenv.cars.settings.profile import Role
@@ -85,6 +85,25 @@ def test_frames_that_a_camera_holds_are_duplicates() -> None:
         [found] = of_repeats([replace(s, role=Role.DETECTIONS) for s in some], "/camera")
         assert "repeat the value of the one before" in found.text
     assert not [f for some in (own, empty) for f in of_repeats([replace(s, role=Role.DETECTIONS) for s in some], "/c")]
+
+
+@pytest.mark.parametrize("pattern", [(1, 2), (1, 1, 3), (2, 3)])
+def test_frames_held_in_a_pattern_are_duplicates(pattern: tuple[int, ...]) -> None:
+    ray = np.random.default_rng(0).normal(size=(900, 3))
+    number = np.repeat(np.arange(900), np.resize(pattern, 900))
+    held = [replace(s, value=Detections((1,), ray[n][None])) for s, n in zip(samples(EVERY), number, strict=False)]
+    assert [*of_repeats([replace(s, role=Role.DETECTIONS) for s in held], "/camera")]
+
+
+def test_messages_lost_at_random_are_stated_and_other_irregular_ones_are_not() -> None:
+    rng, sent = np.random.default_rng(0), samples(EVERY)
+    kept = [sample for sample in sent if rng.random() < 0.5]
+    [found] = of_losses(kept, "/imu")
+    assert found.size == pytest.approx(0.5, abs=0.06) and "multiples of 20 ms" in found.text
+    jitter = samples(np.cumsum(rng.uniform(0.01, 0.04, 800)))
+    few = [sample for sample in sent if rng.random() < 0.9]
+    burst = [sample for sample in sent if not 5 * S < sample.stamp < 12 * S]
+    assert not [f for some in (sent, sent[::2], jitter, few, burst) for f in of_losses(some, "/imu")]
 
 
 def test_a_delay_that_changes_is_stated() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from coopenv import CoopenvError
 from coopenv.cars.messages import codec
-from coopenv.cars.messages.readings import READERS, CarPose, CarStatus, Detections, Twist, read
+from coopenv.cars.messages.readings import (
+    READERS,
+    CarPose,
+    CarStatus,
+    Detections,
+    Sample,
+    Twist,
+    read,
+    without_outliers,
+)
 from coopenv.cars.messages.vision import Calibration, rays
 from coopenv.cars.settings.profile import SVEA, Role
 from coopenv.estimation.lens import distort
@@ -294,3 +304,16 @@ def test_rays_of_pixels_go_right_and_down() -> None:
     assert_allclose(directions[0], [0.0, 0.0, 1.0], atol=1e-15)
     assert directions[1, 0] > 0.4 and directions[2, 1] > 0.35
     assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
+
+
+def test_single_velocities_of_no_car_are_left_out_and_a_topic_in_another_unit_is_not() -> None:
+    fast = {"twist": ((450.0, 0.0, 0.0), (0.0, 0.0, 0.0))}
+    value = read(Role.WHEEL, make(SVEA.topics[Role.WHEEL].type, twist=fast), any_unit=True)
+    assert isinstance(value, Twist) and value.linear is not None and value.linear[0] == 450.0
+    slow = Twist(np.array([0.4, 0.0, 0.0]), None)
+    some = [Sample("car", Role.WHEEL, n, n, value if n == 50 else slow) for n in range(100)]
+    refused = Counter[str]()
+    assert [s.stamp for s in without_outliers(some, refused)] == [n for n in range(100) if n != 50]
+    assert refused.total() == 1 and "beyond 200" in next(iter(refused))
+    in_mm = [replace(s, value=value if n % 10 == 0 else slow) for n, s in enumerate(some)]
+    assert without_outliers(in_mm, refused) == in_mm and refused.total() == 1
