@@ -392,7 +392,7 @@ def restore(checkpoint: Checkpoint, trainer: Trainer) -> None:
         trainer.seconds, trainer.cpu_seconds = checkpoint.progress["seconds"], checkpoint.progress["cpu_seconds"]
         trainer.model.critic_alone = bool(checkpoint.progress["critic_alone"])
         if "world" in arrays:
-            if trainer.remembering:
+            if trainer.remembering and "memory" in arrays["statistics"]:
                 trainer.remembering.go_on_from(arrays["statistics"]["memory"])
             trainer.env.go_on_from(trainer.batch.set_state(arrays["world"]))
         else:
@@ -404,13 +404,12 @@ def restore(checkpoint: Checkpoint, trainer: Trainer) -> None:
 def _arrays(trainer: Trainer) -> Arrays:
     moments = trainer.model.policy.optimizer.state_dict()["state"].items()
     _, key, position, *_ = np.random.get_state()
+    begun = trainer.remembering and trainer.model._last_obs is not None
+    remembered = {"memory": trainer.remembering.state.numpy()} if trainer.remembering and begun else {}
     groups: dict[str, Mapping[str, Any]] = {
         "policy": trainer.tensors(),
         "optimiser": {f"{index}/{name}": values.numpy() for index, row in moments for name, values in row.items()},
-        "statistics": {
-            "returns": trainer.env.returns,
-            **({"memory": trainer.remembering.state.numpy()} if trainer.remembering else {}),
-        },
+        "statistics": {"returns": trainer.env.returns, **remembered},
         "random": {"torch": torch.get_rng_state().numpy(), "numpy": np.append(key, np.uint32(position))},
         "world": _worlds(trainer),
     }

@@ -77,9 +77,9 @@ class Ppo(Section):
     """Initial standard deviation of the exploration; actions reach from -1 to 1."""
     hidden: tuple[Count, ...] = Field(default=(128, 128), min_length=1)
     """Widths of the hidden layers (tanh) of policy and value."""
-    memory: Count | None = None
+    memory: Annotated[int, Field(gt=0, le=4096)] | None = None
     """Width of a memory, a gated recurrent unit, that policy and value read beside the observation; it is learnt along
-    whole rollouts. A clone begins without it."""
+    whole rollouts. A clone begins with an empty one, as does a `start` that has none."""
     observation_clip: Positive = 6.0
     """Bound of observations after normalisation by running mean and standard deviation."""
 
@@ -267,8 +267,6 @@ def read_settings(
         changed |= {f"arms.{arm}": arms[arm], f"{table}.arms.{arm}": arms_here.get(arm, {})}
     for place, change in changed.items():
         raw = merged(raw, _flattened(change, f"{where}: {place}"))
-    if path is not None and isinstance(raw.get("start"), str) and (path.parent / raw["start"] / AGENT_FILE).is_file():
-        raw["start"] = str(path.parent / raw["start"])  # of the file's folder, wherever the training begins
     raw.update({name: value for name, value in changes.items() if value is not None})
     if changes.get("start") is not None:
         raw.pop("clone", None)

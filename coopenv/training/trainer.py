@@ -271,7 +271,8 @@ class Trainer:
             try:
                 self.take(tensors)
             except (RuntimeError, KeyError, ValueError) as error:
-                raise CoopenvError(f"start: {start} has not the widths ppo.hidden = {[*widths]}: {error}") from None
+                here = f"ppo.hidden = {[*widths]} and ppo.memory = {self.plan.settings.ppo.memory or 'none'}"
+                raise CoopenvError(f"start: {start} has not the widths {here}: {error}") from None
             if find_agent(start).training.get("steps") == 0:  # a clone alone, of which no exploration was learnt
                 nn.init.constant_(self.model.policy.log_std, math.log(self.plan.settings.ppo.initial_std))
             if COUNTS not in tensors:
@@ -394,9 +395,13 @@ class Trainer:
             raise ValueError(f"{wrong[0]} is not finite")
         env.statistics.mean[...] = tensors["observation.mean"]
         env.statistics.var[...] = tensors["observation.std"].astype(float) ** 2 - LEAST_VARIANCE
+        remembers = f"{MEMORY}{PARTS[0]}" in tensors
+        if remembers and not self.remembering:
+            raise ValueError("it has a memory")
         for name, values in self._parameters().items():
-            if COUNTS in tensors or not name.startswith(CRITIC):
-                values.copy_(torch.from_numpy(tensors[name]))
+            if (COUNTS in tensors or not name.startswith(CRITIC)) and (remembers or not name.startswith(MEMORY)):
+                first = not remembers and name.endswith("layers.0.weight")
+                values.copy_(torch.from_numpy(self.forgetting(tensors[name]) if first else tensors[name]))
         if COUNTS in tensors:
             env.statistics.count, env.spread.mean, env.spread.var, env.spread.count = map(float, tensors[COUNTS])
 
@@ -432,10 +437,8 @@ class MeanAction:
 
     def reset(self, mask: np.ndarray) -> None:
         """Begin new episodes in the rows of a mask (rows,), bool."""
-        for rule in self._rules:
-            rule.reset(mask)
-        if self._memory:
-            self._memory.reset(mask)
+        for part in (*self._rules, *filter(None, [self._memory])):
+            part.reset(mask)
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return actions without exploration, (rows, A), where vehicles observe (rows, D).

@@ -148,10 +148,12 @@ def test_an_exported_agent_remembers_as_the_trainer_does(tmp_path: Path) -> None
         load_agent(other, trainer.scenario)
 
 
-def test_a_checkpoint_goes_on_with_what_is_remembered(tmp_path: Path) -> None:
+@pytest.mark.parametrize("updates", [0, 1])
+def test_a_checkpoint_goes_on_with_what_is_remembered(updates: int, tmp_path: Path) -> None:
     whole = trainer_of()
     whole.begin()
-    whole.update()
+    for _ in range(updates):
+        whole.update()
     save(tmp_path / "checkpoint.safetensors", whole, Course())
     whole.update()
     again = trainer_of()
@@ -170,6 +172,30 @@ def test_a_clone_begins_without_it_and_drives_as_one() -> None:
         trainer.update()
     learnt = trainer.driver()
     assert not np.allclose(learnt(rows), learnt(rows), atol=1e-6), "what is remembered has come to count"
+
+
+def saved(folder: Path, **settings: object) -> str:
+    trainer = trainer_of(**settings)
+    trainer.begin()
+    trainer.update()
+    shaken(trainer)
+    folder.mkdir()
+    export(folder, folder, trainer, environment_file(FOUR_WAY), [], [])
+    return str(folder)
+
+
+def test_an_agent_without_a_memory_gets_one(tmp_path: Path) -> None:
+    plain = PPO.model_copy(update={"memory": None})
+    name = saved(tmp_path / "plain", ppo=plain)
+    trainer = trainer_of(start=name)
+    trainer.begin()
+    rows, driver = np.random.default_rng(0).uniform(-1, 1, (8, 132)).astype(np.float32), trainer.driver()
+    expected = load_agent(name, trainer.scenario)(rows)
+    for _ in range(2):
+        assert driver(rows) == pytest.approx(expected, abs=1e-5)
+    again = trainer_of(start=saved(tmp_path / "remembering"), ppo=plain)
+    with pytest.raises(coopenv.CoopenvError, match=r"ppo\.memory = none: it has a memory"):
+        again.begin()
 
 
 def test_mistakes_are_one_line(tmp_path: Path) -> None:

@@ -360,11 +360,11 @@ def test_an_agent_names_files_of_its_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["pilot_team", "relay_team"])
-def test_an_agent_that_a_training_begins_as_lies_beside_its_settings(name: str) -> None:
-    folder = data_directory("agents") / name
-    settings = read_settings(folder / "train.toml")
-    assert settings.start == str(folder / "first")
+def test_an_agent_that_a_training_begins_as_lies_in_its_folder(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There the command of the card is given."""
+    monkeypatch.chdir(data_directory("agents") / name)
+    settings = read_settings(Path("train.toml"))
+    assert settings.start == "first"
     first, whole = find_agent(settings.start), find_agent(name)
     assert first.network and whole.network and first.network.observation == whole.network.observation
     assert first.training["steps"] > 0 and whole.training["command"].endswith(f"--seed {whole.training['seed']}")
-    assert read_settings(folder / "train.toml", start="mine").start == "mine"
