@@ -22,6 +22,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from benchmarks.machine import machine
+from coopenv.api.trainers.sb3 import ActingRowsBuffer
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import data_directory
 from coopenv.cli.options import parse_overrides
@@ -36,7 +37,7 @@ ENVIRONMENTS = ("open_square", "facade", "urban_crossing")
 class OriginalTrainer(Trainer):
     """The same training with SB3's own classes."""
 
-    algorithm, policy = PPO, ActorCriticPolicy
+    kinds = (PPO, ActorCriticPolicy, ActingRowsBuffer)
 
 
 def updates(kind: type[Trainer], plan: TrainingPlan) -> Iterator[tuple[float, float]]:

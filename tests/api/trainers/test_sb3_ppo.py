@@ -17,7 +17,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 import coopenv
 from coopenv.api.trainers import sb3
-from coopenv.api.trainers.sb3 import product
+from coopenv.api.trainers.sb3 import ActingRowsBuffer, product
 from coopenv.training.settings import Ppo, Settings, TrainingPlan
 from coopenv.training.trainer import Trainer
 from tests.helpers.four_way import FOUR_WAY
@@ -29,7 +29,7 @@ torch.set_num_threads(1)
 class Original(Trainer):
     """The same training with SB3's own classes."""
 
-    algorithm, policy = PPO, ActorCriticPolicy
+    kinds = (PPO, ActorCriticPolicy, ActingRowsBuffer)
 
 
 class Figures(Logger):
