@@ -313,8 +313,12 @@ STUCK = 0.15
 def of_frozen_streams(car: CarStreams) -> Iterator[Diagnosis]:
     """Yield streams that repeat a value while another one shows that the car moves."""
     known = len(car.tracks["truth_time"]) > 2 and len(car.tracks["wheel_time"]) > 1
-    for found in (_frozen_velocity, _frozen_turning, _frozen_truth) if known else (_frozen_noise,):
-        yield from islice(found(car), 1)
+    named = [
+        each for found in (_frozen_velocity, _frozen_turning, _frozen_truth) if known for each in islice(found(car), 1)
+    ]
+    yield from named
+    subjects = {each.finding.subject for each in named}
+    yield from islice((each for each in _frozen_noise(car) if each.finding.subject not in subjects), 1)
 
 
 def _frozen_noise(car: CarStreams) -> Iterator[Diagnosis]:

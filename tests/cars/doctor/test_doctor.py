@@ -550,14 +550,18 @@ def test_a_velocity_without_noise_that_is_held_does_not_stick() -> None:
     speed = np.clip(np.minimum(0.2 * (t - 2.0), 0.2 * (23.0 - t)), 0.0, 0.35)
     noise = 0.01 * np.random.default_rng(0).normal(size=len(t)) * ((t < 8.0) | (t > 12.0))
 
-    def found(values: np.ndarray) -> list[Any]:
+    def found(values: np.ndarray, **truth: np.ndarray) -> list[Any]:
         tracks = {"wheel_time": t, "wheel": values + 0j, "gyro_time": t, "gyro": 0.1 * np.sin(t), "truth_time": t[:0]}
+        tracks |= truth
         car: Any = SimpleNamespace(name="car", tracks=tracks, topic=lambda roles: "/wheel")
         return [*of_frozen_streams(car)]
 
-    assert not found(speed)
-    [diagnosis] = found(speed + noise)
-    assert "0.35 in a row for" in diagnosis.finding.text
+    place = np.cumsum(speed) * 0.05 + 0j
+    truth = {"truth_time": t, "truth": place, "truth_yaw": np.cumsum(0.1 * np.sin(t)) * 0.05}
+    for given in ({}, truth):  # which moves the car as the held velocity says
+        assert not found(speed, **given)
+        [diagnosis] = found(speed + noise, **given)
+        assert "0.35 in a row for" in diagnosis.finding.text
 
 
 def test_a_landmark_elsewhere_is_named_where_few_bearings_are_to_it() -> None:
