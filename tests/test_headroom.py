@@ -118,7 +118,7 @@ def team_episodes(
 AGREEING = {"take_turns": 0.7, "liar_among_us": 0.7, "broken_camera": 0.6}
 """Least share of worlds in which cooperation earns more, where the planner has the better score in 80 to 91 %."""
 RANKED = ("constant_speed", "route_follower", "stop_when_lost", "keep_contact", "peek", "general")
-"""Drivers beside planners and clone by which the ranks of return and score are compared."""
+"""Drivers beside planners and learned team by which the ranks of return and score are compared."""
 
 
 def team_return(found: Episodes, environment: str) -> np.ndarray:
@@ -134,7 +134,7 @@ def test_drivers_rank_by_their_return_as_by_their_score(environment: str) -> Non
 
     Source: Goodman and Kruskal, Measures of association for cross classifications, JASA 49, 1954 (gamma).
     """
-    agents = [*RANKED, "look_ahead", "team_look_ahead", *[f"{environment}_team"] * (environment in CLONES)]
+    agents = [*RANKED, "look_ahead", "team_look_ahead", f"{environment}_team"]
     found = [team_episodes(environment, agent, "as it is")[0] for agent in agents]
     returns = [team_return(episodes, environment).mean() for episodes in found]
     agree = []
@@ -175,7 +175,7 @@ def test_cooperation_costs_the_helpers_and_pays_for_the_fleet(environment: str) 
         assert honest <= 0.5 * dependent_e95(own, environment)
 
 
-SILENT = ("lighthouse", "scout_platoon", "take_turns", "liar_among_us", "pilot", "two_pilots", "relay")
+SILENT = ("lighthouse", *(name for name in HELPERS if name != "lighthouse"), "pilot", "two_pilots", "relay")
 RADIO_OFF = {"v2x.range": 0.001, "reward.team": "own"}
 
 
@@ -189,16 +189,19 @@ def test_a_team_arrives_as_often_without_radio_as_the_planner_of_one_vehicle(env
     assert fewer.mean() <= 2.0 * fewer.std(ddof=1) / np.sqrt(len(fewer)) and alone.mean() > least
 
 
-CLONES = {"lighthouse": 1.15, "take_turns": 1.15, "liar_among_us": 1.15, "scout_platoon": 1.4}
-"""Largest ratio of a clone's e95 to that of the team planner."""
+TEAMS = {"lighthouse": 1.05, "take_turns": 0.95, "liar_among_us": 0.85, "broken_camera": 1.0, "scout_platoon": 1.1}
+"""Largest ratio of a learned team's e95 to that of the team planner, which knows all covariances."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("environment", CLONES)
+@pytest.mark.parametrize("environment", TEAMS)
 def test_cooperation_is_learnt_from_what_each_vehicle_observes(environment: str) -> None:
+    """The discounted return of the team is above that of selfish planners in 95 % of the worlds."""
     agents = ("look_ahead", "team_look_ahead", f"{environment}_team")
-    selfish, team, learned = (team_episodes(environment, agent, "as it is")[1] for agent in agents)
-    assert learned["e95_m"][0] <= CLONES[environment] * team["e95_m"][0] and learned["e95_m"][2] < selfish["e95_m"][1]
+    (own, selfish), (_, team), (learnt, learned) = (team_episodes(environment, a, "as it is", 64) for a in agents)
+    assert learned["e95_m"][0] <= TEAMS[environment] * team["e95_m"][0] and learned["e95_m"][2] < selfish["e95_m"][1]
+    gain = team_return(learnt, environment) - team_return(own, environment)
+    assert gain.mean() > 3.0 * gain.std(ddof=1) / np.sqrt(len(gain)) and np.mean(gain > 0.0) >= 0.95
     often = team_episodes(environment, f"{environment}_team", "as it is", 256)[1]  # one crash in 32 worlds is over 1 %
     assert often["arrival_rate"][0] >= 0.97 and often["collision_rate"][0] < 0.01
     unseen = [dependent_e95(team_episodes(environment, agent, "cars unseen")[0], environment) for agent in agents]
