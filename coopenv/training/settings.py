@@ -291,7 +291,7 @@ def continued_settings(path: Path, environment: str, **changes: Any) -> Settings
     ppo = team.ppo.model_copy(update={"hidden": own.ppo.hidden, "observation_clip": own.ppo.observation_clip})
     overrides = {key: value for key, value in own.scenario.items() if not key.startswith("reward.")}
     changed = {"ppo": ppo, "scenario": {**team.scenario, **overrides}, "evaluation": team.evaluation}
-    return own.model_copy(update={**changed, "variations": own.variations or team.variations})
+    return own.model_copy(update=changed)
 
 
 def usual_settings(environment: str, overrides: Mapping[str, Any], **changes: Any) -> Settings:

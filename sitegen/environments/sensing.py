@@ -9,7 +9,7 @@ from typing import Any
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
 from coopenv.base.format import json_text
-from coopenv.base.installation import version
+from coopenv.base.installation import data_directory, version
 from coopenv.bench.cards import OVERVIEW, figures_table
 from coopenv.bench.contest import Contest
 from coopenv.bench.evaluation import evaluated
@@ -24,6 +24,8 @@ DRIVERS = ("route_follower", "peek")
 """A driver that looks straight ahead, and one that plans its view."""
 TEAM_DRIVERS = ("look_ahead", "team_look_ahead")
 """A driver that plans for itself, and one that plans for the fleet."""
+RADIO_OFF, SILENT = "radio off", "silent"
+"""The setting without messages, and the folder, in that of a team, of the one that learnt without messages."""
 MADE_BY = "python -m sitegen.environments"
 """Command that pages name; the pages of the project still name that of version 0.9."""
 SHOWN = ("mean", "ci_low", "ci_high")
@@ -41,7 +43,7 @@ def cooperation_settings(scenario: Scenario) -> dict[str, Mapping[str, Any]]:
     hidden = {f"vehicles.{i}.marker": (0.0, 0.0, 9.0) for i in range(len(scenario.vehicles))}  # m; above all images
     lies = [i for i, faults in enumerate(scenario.all_faults) if faults.lie.kind != "none"]
     honest = {"no lies": {f"vehicles.{i}.faults.lie.kind": "none" for i in lies}} if lies else {}
-    return {"as it is": {}, "cars unseen": hidden, "radio off": {"v2x.range": 1e-3}, **honest}
+    return {"as it is": {}, "cars unseen": hidden, RADIO_OFF: {"v2x.range": 1e-3}, **honest}
 
 
 def studied(name: str, scenario: Scenario) -> tuple[tuple[str, ...], dict[str, Mapping[str, Any]]]:
@@ -54,14 +56,24 @@ def studied(name: str, scenario: Scenario) -> tuple[tuple[str, ...], dict[str, M
     return DRIVERS, {how: {"sensing": how} for how in SETTINGS} | shared
 
 
+def retrained(name: str, setting: str) -> list[str]:
+    """Return the folder of the team that learnt without messages, for the setting without them, if there is one."""
+    folder = data_directory("agents") / f"{name}_team" / SILENT
+    return [str(folder)] * (setting == RADIO_OFF and folder.is_dir())
+
+
 def contests(environment: str, scenario: Scenario, worlds: int) -> dict[str, Contest]:
     """Return the drivers that are measured, built, by the name of the setting.
 
     Raises:
         CoopenvError: one cannot drive here, or nothing is driven.
     """
-    drivers, settings = studied(Path(environment).stem, scenario)
-    return {how: Contest.of(environment, overrides, drivers, worlds) for how, overrides in settings.items()}
+    name = Path(environment).stem
+    drivers, settings = studied(name, scenario)
+    return {
+        how: Contest.of(environment, overrides, [*drivers, *retrained(name, how)], worlds)
+        for how, overrides in settings.items()
+    }
 
 
 def write_figures(
@@ -118,7 +130,7 @@ def value_of_sensing_text(environment: str, scenario: Scenario, value: Mapping[s
         return f"{note}{value['text']}"
     rows = _rows(value)
     settings = {how for how, _ in rows}
-    team, shared = measured_drivers(environment) == TEAM_DRIVERS, "radio off" in settings
+    team, shared = measured_drivers(environment) == TEAM_DRIVERS, RADIO_OFF in settings
     return rendered(
         "sensing.md.j2",
         "sitegen.environments",
@@ -128,6 +140,7 @@ def value_of_sensing_text(environment: str, scenario: Scenario, value: Mapping[s
         shared=shared,
         honest="no lies" in settings,
         drivers=studied(environment, scenario)[0],
+        silent=(RADIO_OFF, SILENT) in rows,
         table=figures_table(("setting" if team or shared else "sensing", "agent"), rows.items(), OVERVIEW),
         worlds=value["worlds"],
         coopenv=value["coopenv"],

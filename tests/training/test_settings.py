@@ -82,10 +82,12 @@ def test_by_default_a_training_begins_as_the_planner_if_that_can_drive() -> None
 def test_a_clone_alone_is_continued_in_small_steps_and_others_as_they_were(tmp_path: Path) -> None:
     folder = data_directory("agents")
     team = read_settings(folder / "train.toml", "team", "lighthouse")
-    clone = continued_settings(folder / "lighthouse_team" / "train.toml", "lighthouse", start="lighthouse_team")
-    assert (clone.steps, clone.start, clone.clone) == (team.steps, "lighthouse_team", None)
-    assert clone.ppo == team.ppo.model_copy(update={"hidden": (128, 128)}) and clone.evaluation == team.evaluation
-    assert clone.scenario == team.scenario == {} and clone.variations == team.variations != ()
+    path = tmp_path / "clone.toml"
+    path.write_text("steps = 0\nppo.hidden = [64, 64]\nclone.agent = 'team_look_ahead'\n")
+    clone = continued_settings(path, "lighthouse", start="mine")
+    assert (clone.steps, clone.start, clone.clone) == (team.steps, "mine", None)
+    assert clone.ppo == team.ppo.model_copy(update={"hidden": (64, 64)}) and clone.evaluation == team.evaluation
+    assert clone.scenario == team.scenario == {} and clone.variations == team.variations == ()
     own = tmp_path / "train.toml"
     own.write_text(
         "steps = 0\nright_of_way = true\nclone.agent = 'peek'\nrandomised.randomisation.camera_range = [0.5, 2.0]\n"
@@ -93,7 +95,7 @@ def test_a_clone_alone_is_continued_in_small_steps_and_others_as_they_were(tmp_p
     )
     kept = continued_settings(own, "open_square", start="mine", steps=9)
     here = read_settings(folder / "train.toml", "team", "open_square")
-    assert (kept.right_of_way, kept.steps, kept.scenario, kept.ppo.gae_lambda) == (True, 9, here.scenario, 0.995)
+    assert (kept.right_of_way, kept.steps, kept.scenario, kept.ppo.gae_lambda) == (True, 9, here.scenario, 0.99)
     assert (len(kept.variations), kept.variations[0].share, len(kept.randomised)) == (1, 0.5, 1), "as it was cloned"
     path = folder / "facade_quality" / "train.toml"
     learnt = continued_settings(path, "facade", start="facade_quality", steps=7)
