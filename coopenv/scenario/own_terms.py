@@ -1,7 +1,7 @@
 """Users' own terms: registered by name in a program, or located in a scenario file; see docs/terms.md."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,16 @@ SECTIONS: Mapping[str, Registry[Any]] = {
     "termination": TERMINATION_CONDITIONS,
 }
 """Parts of a scenario with a table `custom`, and the terms that they may name."""
+
+EVERY = "*"
+MODELS = (("dynamics", "model"), ("vehicles", EVERY, "dynamics", "model"))
+"""Places of users' own drives in a scenario, those of single vehicles included."""
+CODE = (
+    *((section, "custom", EVERY, *key) for section in SECTIONS for key in ((), ("function",))),
+    ("sensors", EVERY, "kind"),
+    *MODELS,
+)
+"""Places of references to users' own code in a scenario."""
 
 
 def register_reward(name: str, function: Callable[..., Any], *, unit: str = "1", meaning: str = "") -> None:
@@ -148,49 +158,27 @@ def located(
     By default they become absolute.
     """
     result = dict(raw)
-    for section in SECTIONS:
-        part = result.get(section)
-        if isinstance(part, dict) and isinstance(part.get("custom"), dict):
-            rows = {name: _located(row, folder, place) for name, row in part["custom"].items()}
-            result[section] = {**part, "custom": rows}
-    if isinstance(sensors := result.get("sensors"), list):
-        kinds = [_located(entry.get("kind"), folder, place) if isinstance(entry, dict) else None for entry in sensors]
-        result["sensors"] = [
-            {**entry, "kind": kind} if kind else entry for entry, kind in zip(sensors, kinds, strict=True)
-        ]
-    for section, keys in FILES.items():
-        part = result.get(section)
-        if isinstance(part, dict):
-            result[section] = {k: _placed(v, folder, place) if k in keys else v for k, v in part.items()}
-    return _with_models(result, lambda model: place(model, folder))
-
-
-def _with_models(raw: dict[str, Any], change: Callable[[str], str]) -> dict[str, Any]:
-    """Return a scenario with the places of users' own drives changed, those of single vehicles included."""
-
-    def changed(part: Any) -> Any:
-        drive = part.get("dynamics") if isinstance(part, dict) else None
-        if not isinstance(drive, dict) or not isinstance(drive.get("model"), str):
-            return part
-        own = installation.is_reference(drive["model"])
-        return {**part, "dynamics": {**drive, "model": change(drive["model"])}} if own else part
-
-    result: dict[str, Any] = changed(raw)
-    if isinstance(vehicles := raw.get("vehicles"), list | tuple):
-        result = {**result, "vehicles": [changed(vehicle) for vehicle in vehicles]}
+    for path in CODE:
+        result = _changed(result, path, lambda text: place(text, folder) if installation.is_reference(text) else text)
+    for path in ((section, key) for section, keys in FILES.items() for key in keys):
+        result = _changed(result, path, lambda text: place(text, folder))
     return result
 
 
-def _placed(given: Any, folder: Path, place: Callable[[str, Path], str]) -> Any:
-    if isinstance(given, list):
-        return [_placed(entry, folder, place) for entry in given]
-    return place(given, folder) if isinstance(given, str) else given
+def _changed(part: Any, path: Sequence[str], change: Callable[[str], str]) -> Any:
+    """Return plain data with the texts at a path of keys changed; data without such a place are returned as they are.
 
-
-def _located(row: Any, folder: Path, place: Callable[[str, Path], str]) -> Any:
-    if isinstance(row, dict) and "function" in row:
-        return {**row, "function": _located(row["function"], folder, place)}
-    return place(row, folder) if isinstance(row, str) and installation.is_reference(row) else row
+    The key `*` stands for every entry of a table or a list. In place of a text there may be a list of texts.
+    """
+    key, *rest = path or [EVERY]
+    if not path and isinstance(part, str):
+        return change(part)
+    if isinstance(part, dict) and path:
+        names = part if key == EVERY else {key} & part.keys()
+        return {**part, **{name: _changed(part[name], rest, change) for name in names}}
+    if isinstance(part, list | tuple) and key == EVERY:
+        return [_changed(entry, rest, change) for entry in part]
+    return part
 
 
 def _is_ours(kind: Any, name: str) -> bool:
@@ -219,4 +207,6 @@ def without_own_terms(raw: Mapping[str, Any]) -> dict[str, Any]:
         if section == "termination":
             known = (*kind.built_in, "after_arrival")
             result[section] = {key: on for key, on in part.items() if key in known}
-    return _with_models(result, lambda model: DRIVES[0])
+    for path in MODELS:
+        result = _changed(result, path, lambda model: DRIVES[0] if installation.is_reference(model) else model)
+    return result
