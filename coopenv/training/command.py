@@ -33,6 +33,7 @@ from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE, che
 from coopenv.policies.network import RightOfWay
 from coopenv.scenario import Scenario
 from coopenv.sources.sources import open_simulation
+from coopenv.training.actions import actions_of
 from coopenv.training.batches import Arrays
 from coopenv.training.export import EXPORTED, check_onnx, export
 from coopenv.training.ranking import Figures, Ranking, figures_of
@@ -105,7 +106,7 @@ def possible(plan: TrainingPlan) -> Scenario:
     if not any(scenario.acting):
         raise CoopenvError(f"{plan.environment}: all motion is prescribed or has a driver, there is nothing to learn")
     if plan.settings.start is not None:
-        tensors_of(plan.settings.start, scenario, plan.settings.ppo.observation_clip)
+        tensors_of(plan.settings.start, scenario, plan.settings.ppo.observation_clip, plan.settings.actions)
     for name in plan.settings.evaluation.drivers:
         check_agent(name, "driver (evaluation.drivers)")
     try:
@@ -120,8 +121,9 @@ def possible(plan: TrainingPlan) -> Scenario:
     for own in plan.watched():
         try:
             for each, _ in own.scenarios():
-                if plan.settings.clone is not None:
-                    load_agent(plan.settings.clone.agent, each)
+                actions = actions_of(plan.settings.actions, each)
+                for name in plan.settings.clone.agents if plan.settings.clone else ():
+                    actions.teacher(name, each)
         except CoopenvError as error:
             if own is plan:
                 raise
@@ -165,7 +167,10 @@ def train(
             or something cannot be written; the last checkpoint stays.
     """
     report, path = reports or Reports(), out / CHECKPOINT_FILE
-    scenario, environment = possible(plan), environment_file(plan.environment, plan.all_overrides)
+    scenario, environment = (
+        possible(plan),
+        environment_file(plan.environment, plan.all_overrides, plan.settings.actions),
+    )
     kept = read(path) if resume else None
     if kept is not None:
         onnx, logs = onnx or kept.onnx, logs or kept.logs
@@ -242,7 +247,7 @@ def _notes(trainer: Trainer, course: Course) -> Iterator[str]:
 def _judge_drivers(plan: TrainingPlan, scenario: Scenario, course: Course, report: Reports, judge: Judge) -> None:
     """Judge the drivers that the policy is ranked among, as far as they can drive."""
     seeds = held_out_seeds(0, plan.settings.evaluation.final_worlds)
-    cloned, able = [plan.settings.clone.agent] if plan.settings.clone else [], list[tuple[str, Policy]]()
+    cloned, able = plan.settings.clone.agents if plan.settings.clone else (), list[tuple[str, Policy]]()
     for name in dict.fromkeys((*cloned, *plan.settings.evaluation.drivers)):
         with suppress(CoopenvError):
             policy = load_agent(name, scenario)

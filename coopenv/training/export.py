@@ -18,11 +18,19 @@ from coopenv.base.files import writing
 from coopenv.base.installation import install_command, needing, version, versions
 from coopenv.evaluation import Result
 from coopenv.policies import sets
+from coopenv.policies.choices import STEERING
 from coopenv.policies.loader import AGENT_FILE, NetworkCard
 from coopenv.policies.network import CRITIC, ENTRY, layout_hash, layout_tables
 from coopenv.scenario import Scenario
 from coopenv.training.sets import SetTrainer
-from coopenv.training.settings import SETTINGS_FILE, EnvironmentFile, Settings, settings_digest, write_settings
+from coopenv.training.settings import (
+    SETTINGS_FILE,
+    EnvironmentFile,
+    Settings,
+    own_settings,
+    settings_digest,
+    write_settings,
+)
 from coopenv.training.trainer import Trainer
 
 WEIGHTS_FILE, CURVE_FILE, ONNX_FILE = "weights.safetensors", "curve.csv", "policy.onnx"
@@ -98,6 +106,7 @@ def _network(trainer: Trainer, digest: str) -> NetworkCard:
             for name, field in observation.items()
             if name != "time_left"  # goes on for vehicles that have arrived
         },
+        actions=own_settings(trainer.plan).actions,
         right_of_way=trainer.plan.settings.right_of_way,
         alone=trainer.plan.settings.alone,
     )
@@ -120,7 +129,8 @@ def _card(trainer: Trainer | SetTrainer, environment: EnvironmentFile, results: 
         card = _network(trainer, digest)
     arm = f", arm {plan.arm}" if plan.arm else ""
     others = [each.environment for each in plan.watched() if each is not plan]
-    begun = f"Clone of {plan.settings.clone.agent}" if plan.settings.clone and plan.settings.steps == 0 else "PPO"
+    taught = isinstance(trainer, Trainer) and trainer.teacher or (plan.settings.clone and plan.settings.clone.agents[0])
+    begun = f"Clone of {taught}" if plan.settings.steps == 0 else "PPO"
     document = {
         "title": f"Learned driver of {'many environments' if others else environment.title}",
         "description": f"{begun}, one policy for all vehicles{arm}, seed {plan.seed}.",
@@ -138,6 +148,7 @@ def _card(trainer: Trainer | SetTrainer, environment: EnvironmentFile, results: 
             "scenario": scenario_digest(trainer.scenario),
             "settings": settings_digest(plan),
             **({"arm": plan.arm} if plan.arm else {}),
+            **({"teacher": taught} if taught else {}),
             "steps": trainer.status.steps,
             "discount": plan.settings.ppo.discount(trainer.scenario),  # per decision
             "minutes": round(trainer.status.seconds / 60.0, 2),
@@ -183,6 +194,8 @@ def check_onnx(settings: Settings) -> None:
         raise CoopenvError(f"--onnx: not with network = '{settings.network}'")
     if settings.ppo.memory:
         raise CoopenvError("--onnx: not with ppo.memory, a model has no state")
+    if settings.actions != STEERING:
+        raise CoopenvError(f"--onnx: not with actions = '{settings.actions}', whose driver is no network")
     with needing(f"--onnx needs the package onnx: {install_command('onnx')}"):
         import_module("onnx")
 

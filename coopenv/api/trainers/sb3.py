@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
 from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
@@ -67,8 +68,8 @@ class CooperativeSB3VecEnv(VecEnv):
 
     def __init__(self, envs: CooperativeVectorEnv) -> None:
         """Show a batch with the autoreset mode SAME_STEP and NumPy arrays; `make_sb3_vec_env` builds one by name."""
-        self.envs = envs
-        self.scenario, self.vehicles = envs.scenario, envs.vehicles
+        self.envs, batch = envs, envs.unwrapped
+        self.scenario, self.vehicles = batch.scenario, batch.vehicles
         self.render_mode, self.metadata = "rgb_array", envs.metadata
         self.acted = np.zeros(envs.num_envs, dtype=bool)
         """(num_envs,) whether the row's vehicle was under way in the last step, and acts (any, where none does).
@@ -78,19 +79,19 @@ class CooperativeSB3VecEnv(VecEnv):
         self.batch_infos: dict[str, Any] = {}
         """Infos of the last step as `CooperativeVectorEnv` gives them, arrays (num_envs,)."""
         self._recorder = RecordVehicleEpisodes(envs)
-        self._rows = envs.acting if envs.acting.any() else ~envs.acting
-        self._outcomes, self._begin = outcome_words(envs.scenario), time.time()
+        self._rows = batch.acting if batch.acting.any() else ~batch.acting
+        self._outcomes, self._begin = outcome_words(batch.scenario), time.time()
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     @property
     def engine(self) -> Engine:
         """The engine of the batch; a copy of a batch builds its own."""
-        return self.envs.engine
+        return self.envs.unwrapped.engine
 
     @property
     def observation_layout(self) -> Layout:
         """Name, slice, unit and scale of every field of an observation row."""
-        return self.envs.observation_layout
+        return self.envs.unwrapped.observation_layout
 
     def reset(self) -> Any:
         """Start a new episode in every world; `seed()` and `set_options()` apply once.
@@ -166,7 +167,7 @@ class CooperativeSB3VecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Return one picture, the top view of world 0."""
-        return [self.envs.engine.picture()]
+        return [self.engine.picture()]
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
@@ -325,8 +326,65 @@ def differentiate(layers: Sequence[nn.Linear], found: Sequence[Tensor], slope: T
     return product(slope, layers[0].weight.t()) if through else slope
 
 
+class GaussianActions:
+    """Actions (rows, A) with independent normal distributions about a network's output, of a learnt spread."""
+
+    def __init__(self, policy: "TanhPolicy", output: Tensor, actions: Tensor) -> None:
+        self._policy, self._precision = policy, torch.exp(-policy.log_std)
+        self._deviation = (actions - output) * self._precision
+        self.log_density = -(0.5 * self._deviation**2 + policy.log_std + LOG_DENSITY).sum(1)
+        """Logarithms of the densities of the actions, (rows,)."""
+        self.entropy = float((policy.log_std + LOG_DENSITY + 0.5).sum())
+        """Mean over rows."""
+
+    def slope(self, weight: Tensor, bonus: float) -> Tensor:
+        """Return a loss's derivative with respect to the output, and write that for the spread into its `grad`.
+
+        The loss has the derivatives `weight` (rows, 1) by `log_density`, and `-bonus` by `entropy`.
+        """
+        self._policy.log_std.grad = (weight * (self._deviation**2 - 1.0)).sum(0).sub_(bonus)
+        return weight * self._deviation * self._precision
+
+    @staticmethod
+    def cloning(output: Tensor, aims: Tensor) -> Tensor:
+        """Return the derivative of the mean squared error with respect to the output; `aims` are actions."""
+        excess = output - aims
+        return 2.0 / excess.numel() * excess
+
+
+class CategoricalActions:
+    """Letters (rows, 1) of an alphabet, whose logits are a network's output (rows, K); see `GaussianActions`."""
+
+    def __init__(self, policy: "TanhPolicy", output: Tensor, actions: Tensor) -> None:
+        self._log = output.log_softmax(1)
+        self._share, self._chosen = self._log.exp(), nn.functional.one_hot(actions.long().flatten(), output.shape[1])
+        self.log_density = (self._log * self._chosen).sum(1)
+        self._entropies = -(self._share * self._log).sum(1, keepdim=True)
+        self.entropy = float(self._entropies.mean())
+
+    def slope(self, weight: Tensor, bonus: float) -> Tensor:
+        """See `GaussianActions.slope`."""
+        spread = self._share * (self._log + self._entropies)
+        return weight * (self._chosen - self._share) + bonus / len(spread) * spread
+
+    @staticmethod
+    def cloning(output: Tensor, aims: Tensor) -> Tensor:
+        """Return the derivative of the mean cross entropy with respect to the output; `aims` (rows, K) are shares."""
+        return (output.softmax(1) - aims) / len(aims)
+
+
 class TanhPolicy(ActorCriticPolicy):
-    """SB3's `MlpPolicy` on the CPU for actions in a box: a tanh network for their mean, and one for the value."""
+    """SB3's `MlpPolicy` on the CPU: a tanh network for the mean action or the logits of letters, one for the value."""
+
+    @property
+    def distribution(self) -> type[GaussianActions | CategoricalActions]:
+        """Distribution of the actions about the output of the first network."""
+        return CategoricalActions if isinstance(self.action_space, spaces.Discrete) else GaussianActions
+
+    @property
+    def spread(self) -> dict[str, nn.Parameter]:
+        """Parameters of the distribution beside the networks', by name."""
+        return {"log_std": self.log_std} if self.distribution is GaussianActions else {}
 
     def layers(self) -> tuple[list[nn.Linear], list[nn.Linear]]:
         """Return the layers of the networks for the mean and for the value."""
@@ -337,11 +395,14 @@ class TanhPolicy(ActorCriticPolicy):
         actor, critic = ([*(part for part in net if isinstance(part, nn.Linear)), end] for net, end in networks)
         return actor, critic
 
+    def distribution_about(self, output: Tensor) -> Any:
+        """Return SB3's distribution of actions for outputs of the first network."""
+        return self.action_dist.proba_distribution(output, *self.spread.values())
+
     @torch.no_grad()
     def forward(self, obs: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Return actions (rows, A), values (rows, 1) and logarithms of the actions' densities (rows,)."""
-        mean = outputs(self.layers()[0], obs)[-1]
-        distribution = self.action_dist.proba_distribution(mean, self.log_std)
+        """Return actions (rows, A) or letters (rows,), values (rows, 1) and logarithms of their densities (rows,)."""
+        distribution = self.distribution_about(outputs(self.layers()[0], obs)[-1])
         actions = distribution.get_actions(deterministic)
         return actions, self.predict_values(obs), distribution.log_prob(actions)
 
@@ -381,7 +442,7 @@ class LeanPpo(PPO):
         acted = buffer.swap_and_flatten(buffer.acted).flatten()
         self.explained = float(explained_variance(buffer.values.flatten()[acted], buffer.returns.flatten()[acted]))
         figures["explained_variance"] = float(explained_variance(buffer.values.flatten(), buffer.returns.flatten()))
-        figures["std"] = float(self.policy.log_std.exp().mean())
+        figures |= {"std": float(values.exp().mean()) for values in self.policy.spread.values()}
         for name, value in {**figures, "clip_range": clip}.items():
             self.logger.record(f"train/{name}", value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -389,12 +450,12 @@ class LeanPpo(PPO):
     def _improve(self, rows: RolloutBufferSamples, clip: float) -> dict[str, float]:
         """Take one gradient step on a minibatch; return the figures that SB3 logs of it."""
         policy, (actor, critic), count = self.policy, self.policy.layers(), len(rows.advantages)
-        advantages, precision = rows.advantages, torch.exp(-policy.log_std)
+        advantages = rows.advantages
         if count > 1:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         found = outputs(actor, rows.observations)
-        deviation = (rows.actions - found[-1]) * precision
-        change = -(0.5 * deviation**2 + policy.log_std + LOG_DENSITY).sum(1) - rows.old_log_prob
+        acting = policy.distribution(policy, found[-1], rows.actions)
+        change = acting.log_density - rows.old_log_prob
         ratio = change.exp()
         gain = torch.minimum(advantages * ratio, advantages * ratio.clamp(1.0 - clip, 1.0 + clip))
         # Where the clipped ratio, a constant, gives the smaller gain, the loss does not depend on the density.
@@ -403,8 +464,7 @@ class LeanPpo(PPO):
         policy.optimizer.zero_grad()
         slopes = list[Tensor]()
         if not self.critic_alone:
-            slopes.append(differentiate(actor, found, slope * deviation * precision, self.passes_back))
-            policy.log_std.grad = (slope * (deviation**2 - 1.0)).sum(0).sub_(self.ent_coef)
+            slopes.append(differentiate(actor, found, acting.slope(slope, self.ent_coef), self.passes_back))
         found = outputs(critic, rows.observations)
         excess = found[-1].squeeze(1) - rows.returns
         weighted = excess.mul(2.0 * self.vf_coef / count).unsqueeze(1)
@@ -413,7 +473,7 @@ class LeanPpo(PPO):
         figures = {
             "policy_gradient_loss": -float(gain.mean()),
             "value_loss": float(excess.square().mean()),
-            "entropy_loss": -float((policy.log_std + LOG_DENSITY + 0.5).sum()),
+            "entropy_loss": -acting.entropy,
             "clip_fraction": float(((ratio - 1.0).abs() > clip).float().mean()),
             "approx_kl": float((ratio - 1.0 - change).mean()),
         }
