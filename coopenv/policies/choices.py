@@ -87,10 +87,10 @@ class Choices(RouteFollower):
             return self.chooser(observations[:, : self.layout.size], rows)
         return self.choose(observations, present)
 
-    def matches(self, other: "Choices") -> bool:
+    def matches(self, other: "Choices | None") -> bool:
         """Return whether letters mean the same to another driver."""
-        same = self.alphabet == other.alphabet and self.kept == other.kept
-        return same and type(self).follow is type(other).follow
+        meaning = [(one.alphabet, one.kept, type(one).follow) for one in (self, other) if one]
+        return meaning[:1] == meaning[1:]
 
     def take(self, letters: np.ndarray) -> None:
         """Follow letters, (rows,), for the next `kept` decisions in place of choices of its own."""

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
@@ -83,26 +84,26 @@ class NetworkPolicy:
         self.choices, self._rules = choices, rules
         self._memory = Memory(tensors) if f"{MEMORY}{PARTS[0]}" in tensors else None
         if choices:
-            choices.chooser = lambda observations, rows: np.argmax(self.outputs(observations, rows), axis=1)
-        parts = (*rules, *filter(None, [choices]))
-        self.agents = next((part.agents for part in parts if part.agents), [])
+            choices.chooser = self.chosen
+        self._parts: list[Any] = [part for part in (*rules, self._memory, choices) if part]
+        self.agents: list[str] = next((part.agents for part in self._parts if getattr(part, "agents", ())), [])
         """Names of the vehicles in the order of rows, where a rule or a driver needs the rows of all."""
 
-    def outputs(self, observations: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """Return the outputs of the last layer, (rows, A or letters); flags of `rows`, (rows,): see `Memory`."""
+    def chosen(self, observations: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """Return the most likely actions, (rows, A), or letters, (rows,); flags of `rows`, (rows,): see `Memory`."""
         raise NotImplementedError
 
     def reset(self, mask: np.ndarray) -> None:
         """Begin new episodes in the rows of a mask (rows,), bool."""
-        for part in (*self._rules, *filter(None, [self._memory, self.choices])):
+        for part in self._parts:
             part.reset(mask)
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return the actions without exploration, (rows, A) in [-1, 1], for flat observations, (rows, D)."""
-        actions = self.choices(observations) if self.choices else np.clip(self.outputs(observations), -1.0, 1.0)
+        actions = self.choices(observations) if self.choices else self.chosen(observations)
         for rule in self._rules:
             actions = rule(np.asarray(observations, dtype=np.float32), actions)
-        return np.asarray(actions)
+        return actions
 
 
 class Network(NetworkPolicy):
@@ -157,8 +158,8 @@ class Network(NetworkPolicy):
         self._places = {name: slice(observation[name].start, observation[name].stop) for name in self._seen}
         self._outside = dict.fromkeys(self._seen, 0.0)
 
-    def outputs(self, observations: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """See `NetworkPolicy.outputs`."""
+    def chosen(self, observations: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """See `NetworkPolicy.chosen`."""
         seen = np.clip(observations * self._factor, -1.0, 1.0)
         if self._seen:
             self._compare_with_training(seen[seen.any(axis=1)])
@@ -168,7 +169,8 @@ class Network(NetworkPolicy):
         for weight, bias in self._layers[:-1]:
             values = np.tanh(values @ weight + bias)
         weight, bias = self._layers[-1]
-        return np.asarray(values @ weight + bias)
+        values = values @ weight + bias
+        return np.asarray(np.argmax(values, axis=1) if self.choices else np.clip(values, -1.0, 1.0))
 
     def _compare_with_training(self, observations: np.ndarray) -> None:
         """Warn, once, where many entries of a field lie beyond those of the training."""

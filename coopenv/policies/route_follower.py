@@ -419,7 +419,7 @@ class RouteFollower(Driver):
     @state.setter
     def state(self, state: Sequence[np.ndarray]) -> None:
         self._memory, received, place, age, leapt, *last = state
-        self._reported, self._last = (received, place, age, leapt), tuple(last)  # type: ignore[assignment]
+        self._reported, self._last = (received, place, age, leapt), tuple(last)
 
     def going(self, observations: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Return the arc lengths, (rows, P) in m, at times (P,) in s of going on at full speed."""

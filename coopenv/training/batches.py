@@ -84,7 +84,7 @@ class NormalisedEnv(VecEnvWrapper):
     def __init__(
         self, venv: CooperativeSB3VecEnv, ppo: Ppo, rule: RightOfWay | None = None, gamma: float | None = None
     ) -> None:
-        """Wrap a batch; a rule is below the actions of the policy, `gamma` the discount per step, if not that of `ppo`."""
+        """Wrap a batch; a rule is below the actions of the policy; `gamma` is the discount per step."""
         shape = venv.observation_space.shape
         super().__init__(
             venv,

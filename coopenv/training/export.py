@@ -129,8 +129,7 @@ def _card(trainer: Trainer | SetTrainer, environment: EnvironmentFile, results: 
         card = _network(trainer, digest)
     arm = f", arm {plan.arm}" if plan.arm else ""
     others = [each.environment for each in plan.watched() if each is not plan]
-    taught = isinstance(trainer, Trainer) and trainer.teacher or (plan.settings.clone and plan.settings.clone.agents[0])
-    begun = f"Clone of {taught}" if plan.settings.steps == 0 else "PPO"
+    begun = f"Clone of {trainer.teacher}" if plan.settings.steps == 0 else "PPO"
     document = {
         "title": f"Learned driver of {'many environments' if others else environment.title}",
         "description": f"{begun}, one policy for all vehicles{arm}, seed {plan.seed}.",
@@ -148,7 +147,7 @@ def _card(trainer: Trainer | SetTrainer, environment: EnvironmentFile, results: 
             "scenario": scenario_digest(trainer.scenario),
             "settings": settings_digest(plan),
             **({"arm": plan.arm} if plan.arm else {}),
-            **({"teacher": taught} if taught else {}),
+            **({"teacher": trainer.teacher} if trainer.teacher else {}),
             "steps": trainer.status.steps,
             "discount": plan.settings.ppo.discount(trainer.scenario),  # per decision
             "minutes": round(trainer.status.seconds / 60.0, 2),

@@ -65,6 +65,7 @@ class SetTrainer:
         """
         torch.set_num_threads(1)
         self.plan, self.scenario, self.clone, self.threads = plan, scenario, clone, threads or 1
+        self.teacher = clone.agents[0]
         self.tensors: dict[str, np.ndarray] = {}
         """The weights, float32."""
         self.seen: dict[str, tuple[float, float]] = {}

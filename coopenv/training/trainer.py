@@ -15,15 +15,8 @@ from stable_baselines3.common.logger import Logger
 from torch import nn
 
 from coopenv.api.terms.layout import observation_layout
-from coopenv.api.trainers.sb3 import (
-    ActingRowsBuffer,
-    CooperativeSB3VecEnv,
-    GaussianActions,
-    LeanPpo,
-    TanhPolicy,
-    differentiate,
-    outputs,
-)
+from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv, LeanPpo, TanhPolicy, differentiate, outputs
+from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.base.errors import CoopenvError
 from coopenv.policies import Policy, find_agent, restart
 from coopenv.policies.alone import Alone
@@ -139,7 +132,9 @@ def watch(
     """
     kind, name, noise = kind or Steering(), settings.agents[0], np.random.default_rng(seed)
     driver = kind.teacher(name, scenario)
-    env = kind.rows(driver, scenario, worlds, threads)
+    env = kind.batch(
+        CooperativeVectorEnv(scenario, "clone", num_worlds=worlds, autoreset="disabled", threads=threads), driver
+    )
     observation, _ = env.reset(seed=seed)
     restart(driver, np.ones(env.num_envs, dtype=bool))
     under_way = np.tile(scenario.acting, worlds)
@@ -193,8 +188,8 @@ def tensors_of(name: str, scenario: Scenario, clip: float, actions: str = STEERI
     agent, here = find_agent(name), layout_tables(observation_layout(scenario))
     if agent.folder is None or agent.network is None or not agent.network.observation:
         raise CoopenvError(f"start: {name} is no policy that PPO learns; clone.agent begins as any driver")
-    theirs, ours = choices_of(agent.policy(scenario)), actions_of(actions, scenario).driver(scenario)
-    if theirs and ours and not theirs.matches(ours) or (theirs is None) != (ours is None):
+    theirs, ours = choices_of(agent.policy(scenario)), actions_of(actions, scenario).choices
+    if not ours.matches(theirs) if ours else theirs:
         raise CoopenvError(f"start: {name} chooses other actions than actions = '{actions}': {agent.network.actions}")
     if (agent.network.observation, agent.network.action) != here:
         raise CoopenvError(f"start: {name} was trained with other fields or scales of the observation")
@@ -230,7 +225,11 @@ class Trainer:
         ppo = plan.settings.ppo
         self._scenarios = plan.scenarios(max(1, ppo.vehicles // sum(scenario.acting)))
         self.actions = actions_of(plan.settings.actions, scenario)
-        parts = [self.actions.batch(each, plan.environment, count, threads) for each, count in self._scenarios]
+        options: Any = {"autoreset": "disabled" if self.actions.choices else "same_step", "arrays": "numpy"}
+        built = partial(CooperativeVectorEnv, name=plan.environment, threads=threads, **options)
+        parts = [
+            CooperativeSB3VecEnv(self.actions.batch(built(each, num_worlds=count))) for each, count in self._scenarios
+        ]
         self.rule, rule = (RightOfWay(scenario) if plan.settings.right_of_way else None for _ in range(2))
         self.batch = parts[0] if len(parts) == 1 else MixedWorlds(parts)
         self.gamma = ppo.discount(scenario) ** self.actions.kept
@@ -312,9 +311,8 @@ class Trainer:
                 env.spread.update(returns)
             observations = torch.from_numpy(self.forgetting(env.normalise(raw)))
             values = (env.reward_scale * returns)[:, None]
-            aims = self.actions.aims(actions, clone.smoothing), values
-            targets = [torch.from_numpy(values.astype(np.float32)) for values in aims]
-            slopes = partial(self._differentiate, observations, targets)
+            targets = [torch.from_numpy(aims.astype(np.float32)) for aims in (actions, values)]
+            slopes = partial(self._differentiate, observations, targets, clone.smoothing)
             chosen = (part for layers in networks for layer in layers for part in layer.parameters())
             regress(chosen, len(observations), clone, self.plan.seed, slopes, report)
         env.looked_at.append(raw)
@@ -328,16 +326,20 @@ class Trainer:
             rule = RightOfWay(each) if self.rule else None
             yield watch(each, worlds, clone, self.gamma, start, threads, report, self.actions, rule, driving)
 
-    def _differentiate(self, observations: torch.Tensor, targets: list[torch.Tensor], rows: torch.Tensor) -> None:
+    def _differentiate(
+        self, observations: torch.Tensor, targets: list[torch.Tensor], smoothing: float, rows: torch.Tensor
+    ) -> None:
         """Write the derivatives of the losses of policy and value into `grad`.
 
-        Observations are (M, D), normalised, targets (M, A), or (M, K) for letters, and (M, 1); `rows` (B,) are the
+        Observations are (M, D), normalised, targets (M, A), or (M,) for letters, and (M, 1); `rows` (B,) are the
         numbers of those that count.
         """
-        kinds = self.model.policy.distribution, GaussianActions
-        for kind, layers, aims in zip(kinds, self.model.policy.layers(), targets, strict=True):
+        losses = self.actions.loss, Steering().loss
+        for loss, layers, aims in zip(losses, self.model.policy.layers(), targets, strict=True):
             found = outputs(layers, observations[rows])
-            differentiate(layers, found, kind.cloning(found[-1], aims[rows]))
+            with torch.enable_grad():
+                loss(found[-1].requires_grad_(), aims[rows], smoothing).backward()
+            differentiate(layers, found, found[-1].grad)
 
     def update(self) -> Status:
         """Collect one rollout and learn from it.
@@ -444,25 +446,18 @@ class Trainer:
 
 
 class MeanAction(NetworkPolicy):
-    """The most likely action of a trainer's policy."""
+    """The mean action, or the most likely letter, of a trainer's policy."""
 
     def __init__(self, trainer: Trainer, *further: Alone) -> None:
         """Take the policy, and rules beside that of the training."""
         self._trainer = trainer
-        rules = [*([trainer.rule] if trainer.rule else []), *further]
-        super().__init__(trainer.actions.driver(trainer.scenario), rules, trainer.tensors())
+        choices = actions_of(trainer.plan.settings.actions, trainer.scenario).choices
+        super().__init__(choices, [*([trainer.rule] if trainer.rule else []), *further], trainer.tensors())
 
-    @torch.no_grad()
-    def outputs(self, observations: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """See `NetworkPolicy.outputs`.
-
-        Raises:
-            DivergedError: the policy is not finite.
-        """
+    def chosen(self, observations: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """See `NetworkPolicy.chosen`. Raises DivergedError: the policy is not finite."""
         trainer = self._trainer
         seen = trainer.env.normalise(observations)
         with trainer.finite():
             remembered = self._memory(seen, rows) if self._memory else seen
-            found = outputs(trainer.model.policy.layers()[0], torch.from_numpy(remembered))[-1]
-            trainer.model.policy.distribution_about(found)  # torch refuses one that is not finite
-        return found.numpy()
+            return np.asarray(trainer.model.predict(remembered, deterministic=True)[0])

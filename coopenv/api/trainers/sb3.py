@@ -1,12 +1,11 @@
 """Stable-Baselines3: the batch as a native `VecEnv`, rows (world, vehicle), and a faster PPO. Needs the extra `train`.
 
-PPO has the gradient of its loss in closed form. Loss, minibatches, optimiser and random numbers are those of SB3's
-`PPO`, and so are the results, except for rounding. The update takes less CPU time: no graph is recorded, tanh is
+PPO has the gradients of its networks in closed form. Loss, minibatches, optimiser and random numbers are those of SB3's
+`PPO`, and so are the results, except for rounding. The update takes less CPU time: hardly a graph is recorded, tanh is
 NumPy's, and on AMD matrices are multiplied by oneDNN.
 """
 
 import copy
-import math
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from functools import cache
@@ -79,6 +78,7 @@ class CooperativeSB3VecEnv(VecEnv):
         self.batch_infos: dict[str, Any] = {}
         """Infos of the last step as `CooperativeVectorEnv` gives them, arrays (num_envs,)."""
         self._recorder = RecordVehicleEpisodes(envs)
+        self._driver: Any = getattr(envs, "driver", None)  # of `ChoiceRows`
         self._rows = batch.acting if batch.acting.any() else ~batch.acting
         self._outcomes, self._begin = outcome_words(batch.scenario), time.time()
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
@@ -107,7 +107,8 @@ class CooperativeSB3VecEnv(VecEnv):
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return the state of the next step as arrays, for `set_state`; plug-in observers are not supported."""
-        return {**self.engine.get_state(), "episode_sums": self._recorder.sums.copy()}
+        remembered = {f"driver.{i}": values for i, values in enumerate(self._driver.state if self._driver else ())}
+        return {**self.engine.get_state(), "episode_sums": self._recorder.sums.copy(), **remembered}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> np.ndarray:
         """Continue from a state of `get_state`, and return its observations.
@@ -115,10 +116,13 @@ class CooperativeSB3VecEnv(VecEnv):
         Raises:
             CoopenvError: it does not fit.
         """
-        sums = state["episode_sums"]
+        rest = dict(state)
+        sums = rest.pop("episode_sums")
         if sums.shape != self._recorder.sums.shape or not np.isfinite(sums).all():
             raise CoopenvError(f"sums of episodes: expected finite numbers of shape {self._recorder.sums.shape}")
-        self.engine.set_state({name: values for name, values in state.items() if name != "episode_sums"})
+        if self._driver:
+            self._driver.state = [rest.pop(f"driver.{i}").copy() for i in range(len(self._driver.state))]
+        self.engine.set_state(rest)
         self._recorder.sums[...] = sums
         self._parked = self.engine.view("ended").reshape(-1) != Outcome.UNDER_WAY
         return self.engine.view("observation").reshape(self.num_envs, -1).copy()
@@ -278,7 +282,6 @@ class ActingRowsBuffer(RolloutBuffer):
 
 ONEDNN: Any = getattr(torch.ops.mkldnn, "_linear_pointwise", None)  # private to torch
 CPUINFO = Path("/proc/cpuinfo")
-LOG_DENSITY = 0.5 * math.log(2.0 * math.pi)  # of a standard normal number at 0, negated
 
 
 @cache
@@ -326,65 +329,13 @@ def differentiate(layers: Sequence[nn.Linear], found: Sequence[Tensor], slope: T
     return product(slope, layers[0].weight.t()) if through else slope
 
 
-class GaussianActions:
-    """Actions (rows, A) with independent normal distributions about a network's output, of a learnt spread."""
-
-    def __init__(self, policy: "TanhPolicy", output: Tensor, actions: Tensor) -> None:
-        self._policy, self._precision = policy, torch.exp(-policy.log_std)
-        self._deviation = (actions - output) * self._precision
-        self.log_density = -(0.5 * self._deviation**2 + policy.log_std + LOG_DENSITY).sum(1)
-        """Logarithms of the densities of the actions, (rows,)."""
-        self.entropy = float((policy.log_std + LOG_DENSITY + 0.5).sum())
-        """Mean over rows."""
-
-    def slope(self, weight: Tensor, bonus: float) -> Tensor:
-        """Return a loss's derivative with respect to the output, and write that for the spread into its `grad`.
-
-        The loss has the derivatives `weight` (rows, 1) by `log_density`, and `-bonus` by `entropy`.
-        """
-        self._policy.log_std.grad = (weight * (self._deviation**2 - 1.0)).sum(0).sub_(bonus)
-        return weight * self._deviation * self._precision
-
-    @staticmethod
-    def cloning(output: Tensor, aims: Tensor) -> Tensor:
-        """Return the derivative of the mean squared error with respect to the output; `aims` are actions."""
-        excess = output - aims
-        return 2.0 / excess.numel() * excess
-
-
-class CategoricalActions:
-    """Letters (rows, 1) of an alphabet, whose logits are a network's output (rows, K); see `GaussianActions`."""
-
-    def __init__(self, policy: "TanhPolicy", output: Tensor, actions: Tensor) -> None:
-        self._log = output.log_softmax(1)
-        self._share, self._chosen = self._log.exp(), nn.functional.one_hot(actions.long().flatten(), output.shape[1])
-        self.log_density = (self._log * self._chosen).sum(1)
-        self._entropies = -(self._share * self._log).sum(1, keepdim=True)
-        self.entropy = float(self._entropies.mean())
-
-    def slope(self, weight: Tensor, bonus: float) -> Tensor:
-        """See `GaussianActions.slope`."""
-        spread = self._share * (self._log + self._entropies)
-        return weight * (self._chosen - self._share) + bonus / len(spread) * spread
-
-    @staticmethod
-    def cloning(output: Tensor, aims: Tensor) -> Tensor:
-        """Return the derivative of the mean cross entropy with respect to the output; `aims` (rows, K) are shares."""
-        return (output.softmax(1) - aims) / len(aims)
-
-
 class TanhPolicy(ActorCriticPolicy):
     """SB3's `MlpPolicy` on the CPU: a tanh network for the mean action or the logits of letters, one for the value."""
 
     @property
-    def distribution(self) -> type[GaussianActions | CategoricalActions]:
-        """Distribution of the actions about the output of the first network."""
-        return CategoricalActions if isinstance(self.action_space, spaces.Discrete) else GaussianActions
-
-    @property
     def spread(self) -> dict[str, nn.Parameter]:
-        """Parameters of the distribution beside the networks', by name."""
-        return {"log_std": self.log_std} if self.distribution is GaussianActions else {}
+        """Parameters of the distribution of actions beside the networks', by name."""
+        return {"log_std": self.log_std} if hasattr(self, "log_std") else {}
 
     def layers(self) -> tuple[list[nn.Linear], list[nn.Linear]]:
         """Return the layers of the networks for the mean and for the value."""
@@ -442,7 +393,7 @@ class LeanPpo(PPO):
         acted = buffer.swap_and_flatten(buffer.acted).flatten()
         self.explained = float(explained_variance(buffer.values.flatten()[acted], buffer.returns.flatten()[acted]))
         figures["explained_variance"] = float(explained_variance(buffer.values.flatten(), buffer.returns.flatten()))
-        figures |= {"std": float(values.exp().mean()) for values in self.policy.spread.values()}
+        figures |= {name.removeprefix("log_"): float(v.exp().mean()) for name, v in self.policy.spread.items()}
         for name, value in {**figures, "clip_range": clip}.items():
             self.logger.record(f"train/{name}", value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -450,34 +401,35 @@ class LeanPpo(PPO):
     def _improve(self, rows: RolloutBufferSamples, clip: float) -> dict[str, float]:
         """Take one gradient step on a minibatch; return the figures that SB3 logs of it."""
         policy, (actor, critic), count = self.policy, self.policy.layers(), len(rows.advantages)
-        advantages = rows.advantages
+        advantages, found = rows.advantages, outputs(actor, rows.observations)
         if count > 1:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-        found = outputs(actor, rows.observations)
-        acting = policy.distribution(policy, found[-1], rows.actions)
-        change = acting.log_density - rows.old_log_prob
-        ratio = change.exp()
-        gain = torch.minimum(advantages * ratio, advantages * ratio.clamp(1.0 - clip, 1.0 + clip))
-        # Where the clipped ratio, a constant, gives the smaller gain, the loss does not depend on the density.
-        free = torch.where(advantages > 0.0, ratio <= 1.0 + clip, ratio >= 1.0 - clip)
-        slope = (free * advantages * ratio).div_(-count).unsqueeze(1)  # with respect to the logarithm of the density
+        taken = rows.actions.long().flatten() if isinstance(self.action_space, spaces.Discrete) else rows.actions
+        with torch.enable_grad():  # of the distribution; derivatives of the networks are in closed form
+            output = found[-1].requires_grad_()
+            distribution = policy.distribution_about(output)
+            change = distribution.log_prob(taken) - rows.old_log_prob
+            ratio = change.exp()
+            gain = torch.minimum(advantages * ratio, advantages * ratio.clamp(1.0 - clip, 1.0 + clip)).mean()
+            entropy = distribution.entropy().mean()
+            loss = -gain - self.ent_coef * entropy
         policy.optimizer.zero_grad()
         slopes = list[Tensor]()
         if not self.critic_alone:
-            slopes.append(differentiate(actor, found, acting.slope(slope, self.ent_coef), self.passes_back))
+            loss.backward()
+            slopes.append(differentiate(actor, found, output.grad, self.passes_back))
         found = outputs(critic, rows.observations)
         excess = found[-1].squeeze(1) - rows.returns
         weighted = excess.mul(2.0 * self.vf_coef / count).unsqueeze(1)
         slopes.append(differentiate(critic, found, weighted, self.passes_back))
         self.pass_back(slopes)
         figures = {
-            "policy_gradient_loss": -float(gain.mean()),
+            "policy_gradient_loss": -gain.item(),
             "value_loss": float(excess.square().mean()),
-            "entropy_loss": -acting.entropy,
+            "entropy_loss": -entropy.item(),
             "clip_fraction": float(((ratio - 1.0).abs() > clip).float().mean()),
             "approx_kl": float((ratio - 1.0 - change).mean()),
         }
         nn.utils.clip_grad_norm_(policy.parameters(), self.max_grad_norm, foreach=True)
         policy.optimizer.step()
-        weighted = self.ent_coef * figures["entropy_loss"] + self.vf_coef * figures["value_loss"]
-        return {**figures, "loss": figures["policy_gradient_loss"] + weighted}
+        return {**figures, "loss": loss.item() + self.vf_coef * figures["value_loss"]}
