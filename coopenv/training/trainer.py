@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from torch import nn
+from torch import Tensor, nn
 
 from coopenv.api.terms.layout import observation_layout
 from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv, LeanPpo, TanhPolicy, differentiate, outputs
@@ -164,7 +164,7 @@ def regress(
     count: int,
     clone: Clone,
     seed: int,
-    slopes: Callable[[torch.Tensor], None],
+    slopes: Callable[[Tensor], None],
     report: Callable[[str], None],
 ) -> None:
     """Minimise a loss over `count` recorded rows; `slopes` writes its derivatives, for rows by index, into `grad`."""
@@ -327,7 +327,7 @@ class Trainer:
             yield watch(each, worlds, clone, self.gamma, start, threads, report, self.actions, rule, driving)
 
     def _differentiate(
-        self, observations: torch.Tensor, targets: list[torch.Tensor], smoothing: float, rows: torch.Tensor
+        self, observations: Tensor, targets: list[Tensor], smoothing: float, rows: Tensor
     ) -> None:
         """Write the derivatives of the losses of policy and value into `grad`.
 
@@ -424,7 +424,7 @@ class Trainer:
         if COUNTS in tensors:
             env.statistics.count, env.spread.mean, env.spread.var, env.spread.count = map(float, tensors[COUNTS])
 
-    def _parameters(self) -> dict[str, torch.Tensor]:
+    def _parameters(self) -> dict[str, Tensor]:
         """Return the learnt parameters by the names of an agent's weights."""
         networks = zip(("", CRITIC), self.model.policy.layers(), strict=True)
         each = [(f"{prefix}layers.{i}", layer) for prefix, layers in networks for i, layer in enumerate(layers)]
