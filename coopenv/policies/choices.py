@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from coopenv.base import installation
 from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import absolute_reference
+from coopenv.policies.loader import load_agent
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import Scenario
 
@@ -144,18 +145,14 @@ def load_choices(actions: str, scenario: Scenario, folder: Path | None = None) -
     Raises:
         CoopenvError: there is no such subclass, or it cannot drive in this scenario.
     """
-    made: Any = Choices
-    if actions != CHOICES:
-        made = installation.load_reference(installation.absolute_reference(actions, folder))
-    if not (isinstance(made, type) and issubclass(made, Choices)):
+    own = f"{Choices.__module__}:{Choices.__name__}" if actions == CHOICES else absolute_reference(actions, folder)
+    found = choices_of(load_agent(own, scenario))
+    if found is None:
         raise CoopenvError(f"actions: {actions} is no subclass of {Choices.__module__}.Choices")
-    try:
-        return made(scenario)
-    except ValueError as error:
-        raise CoopenvError(f"actions: {actions}: {error}") from None
+    return found
 
 
 def choices_of(policy: Any) -> Choices | None:
     """Return the driver with the alphabet of a policy that chooses letters, None for others."""
-    found = policy if isinstance(policy, Choices) else getattr(policy, CHOICES, None)
+    found = getattr(policy, CHOICES, policy)
     return found if isinstance(found, Choices) else None

@@ -7,7 +7,7 @@ while writing keeps the one before.
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -38,7 +38,7 @@ from coopenv.training.batches import Arrays
 from coopenv.training.export import EXPORTED, check_onnx, export
 from coopenv.training.ranking import Figures, Ranking, figures_of
 from coopenv.training.sets import SetTrainer
-from coopenv.training.settings import TrainingPlan, check_settings, environment_file
+from coopenv.training.settings import Settings, TrainingPlan, check_settings, environment_file
 from coopenv.training.trainer import DivergedError, Status, Trainer, tensors_of
 
 NAMES = (*EXPORTED, CHECKPOINT_FILE, *CARD_FILES)
@@ -75,6 +75,8 @@ class Course(BaseModel):
     """Figures in worlds for validation, a row per look."""
     drivers: dict[str, Figures] = Field(default_factory=dict)
     """Figures of other drivers, and of the clone, in the held-out worlds of the end."""
+    teacher: str = ""
+    """The agent that is cloned, if any."""
     best: dict[str, Any] = Field(default_factory=dict, exclude=True)
     """Tensors of the policy of the best row of the curve."""
 
@@ -184,9 +186,12 @@ def train(
     course = kept.course if kept is not None else Course()
     seeds = held_out_seeds(0, plan.settings.evaluation.final_worlds)
     judge = partial(_judge, scenario, threads, report)
+    if kept is None and plan.settings.clone:
+        course.teacher = _best_teacher(scenario, plan.settings, plan.settings.clone.agents, judge)
     if plan.settings.network and plan.settings.clone:
         _judge_drivers(plan, scenario, course, report, judge)
-        cloned = SetTrainer(plan, scenario, plan.settings.clone, threads)
+        clone = plan.settings.clone.model_copy(update={"agent": course.teacher})
+        cloned = SetTrainer(plan, scenario, clone, threads)
         cloned.begin(report.cloning)
         results = judge(cloned.mean_action, out.name, seeds)
         with replacing_folder(out, (*NAMES, environment.name, *environment.code)) as folder:
@@ -194,6 +199,7 @@ def train(
         report.ranked(_ranking(out, course, results, ()))
         return results
     with closing(Trainer(plan, scenario, threads)) as trainer:
+        trainer.teacher = course.teacher
         with new_folder(out), new_folder(logs or out / LOGS) as tensorboard:
             check_file(path)
             trainer.model.set_logger(configure(str(tensorboard), ["tensorboard"]))
@@ -237,11 +243,26 @@ def _notes(trainer: Trainer, course: Course) -> Iterator[str]:
     """Yield what is to be known of a training that did not go on to its end, or whose last policy is not the best."""
     status, settings = trainer.status, trainer.plan.settings
     yield from trainer.notes
+    if settings.clone and len(settings.clone.agents) > 1:
+        yield f"Cloned: {course.teacher}, the best of {len(settings.clone.agents)} agents in the worlds for validation"
     if status.share < 1.0:
         spent = f"{status.steps:,} of {settings.steps:,} steps"
         yield f"Stopped by --minutes {settings.minutes:g} after {spent}: another load gives another agent"
     if course.curve and settings.evaluation.keep == "best" and (steps := course.best_row["steps"]) < status.steps:
         yield f"Kept: the policy after {steps:,} steps, the best in the worlds for validation"
+
+
+def _best_teacher(scenario: Scenario, settings: Settings, names: Sequence[str], judge: Judge) -> str:
+    """Return the best of several agents in the worlds for validation."""
+    if len(names) == 1:
+        return names[0]
+    figures = {name: figures_of(judge(load_agent(name, scenario), name, _validation(settings))) for name in names}
+    return min(names, key=lambda name: ranking_key(figures[name]))
+
+
+def _validation(settings: Settings) -> list[int]:
+    """Return the seeds of the worlds that are looked at while learning."""
+    return [evaluation_seed(WHILE_LEARNING + world) for world in range(settings.evaluation.worlds)]
 
 
 def _judge_drivers(plan: TrainingPlan, scenario: Scenario, course: Course, report: Reports, judge: Judge) -> None:
@@ -264,7 +285,7 @@ def _learn(trainer: Trainer, course: Course, report: Reports, judge: Judge, keep
     """
     settings, kept = trainer.plan.settings, trainer.seconds
     evaluation, longest = settings.evaluation, 60.0 * (settings.minutes or np.inf)
-    seeds = [evaluation_seed(WHILE_LEARNING + world) for world in range(evaluation.worlds)]
+    seeds = _validation(settings)
 
     def look() -> None:
         status = trainer.status

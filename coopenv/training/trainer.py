@@ -326,9 +326,7 @@ class Trainer:
             rule = RightOfWay(each) if self.rule else None
             yield watch(each, worlds, clone, self.gamma, start, threads, report, self.actions, rule, driving)
 
-    def _differentiate(
-        self, observations: Tensor, targets: list[Tensor], smoothing: float, rows: Tensor
-    ) -> None:
+    def _differentiate(self, observations: Tensor, targets: list[Tensor], smoothing: float, rows: Tensor) -> None:
         """Write the derivatives of the losses of policy and value into `grad`.
 
         Observations are (M, D), normalised, targets (M, A), or (M,) for letters, and (M, 1); `rows` (B,) are the
