@@ -19,11 +19,6 @@ class Steering:
     choices: Choices | None = None
     """A driver that follows what a policy chooses; None: the environment does."""
 
-    @property
-    def kept(self) -> int:
-        """Decisions for which an action is kept."""
-        return self.choices.kept if self.choices else 1
-
     def teacher(self, agent: str, scenario: Scenario) -> Policy:
         """Load an agent to learn from. Raises CoopenvError: it cannot drive there, or does not choose such actions."""
         return load_agent(agent, scenario)

@@ -81,10 +81,8 @@ class NormalisedEnv(VecEnvWrapper):
 
     venv: CooperativeSB3VecEnv
 
-    def __init__(
-        self, venv: CooperativeSB3VecEnv, ppo: Ppo, rule: RightOfWay | None = None, gamma: float | None = None
-    ) -> None:
-        """Wrap a batch; a rule is below the actions of the policy; `gamma` is the discount per step."""
+    def __init__(self, venv: CooperativeSB3VecEnv, ppo: Ppo, rule: RightOfWay | None = None) -> None:
+        """Wrap a batch; a rule is below the actions of the policy."""
         shape = venv.observation_space.shape
         super().__init__(
             venv,
@@ -92,7 +90,7 @@ class NormalisedEnv(VecEnvWrapper):
         )
         self.statistics = RunningMeanStd(shape=shape or ())
         self._clip, self._scale = ppo.observation_clip, ppo.reward_scale
-        self._gamma = gamma or ppo.discount(venv.scenario)
+        self._gamma = ppo.discount(venv.scenario) ** venv.kept
         self.spread = RunningMeanStd(shape=())
         """Running mean and variance of discounted returns, in the units of the scenario."""
         self.returns = np.zeros(venv.num_envs)

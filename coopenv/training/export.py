@@ -23,14 +23,7 @@ from coopenv.policies.loader import AGENT_FILE, NetworkCard
 from coopenv.policies.network import CRITIC, ENTRY, layout_hash, layout_tables
 from coopenv.scenario import Scenario
 from coopenv.training.sets import SetTrainer
-from coopenv.training.settings import (
-    SETTINGS_FILE,
-    EnvironmentFile,
-    Settings,
-    own_settings,
-    settings_digest,
-    write_settings,
-)
+from coopenv.training.settings import SETTINGS_FILE, EnvironmentFile, Settings, settings_digest, write_settings
 from coopenv.training.trainer import Trainer
 
 WEIGHTS_FILE, CURVE_FILE, ONNX_FILE = "weights.safetensors", "curve.csv", "policy.onnx"
@@ -106,7 +99,7 @@ def _network(trainer: Trainer, digest: str) -> NetworkCard:
             for name, field in observation.items()
             if name != "time_left"  # goes on for vehicles that have arrived
         },
-        actions=own_settings(trainer.plan).actions,
+        actions=trainer.plan.portable.actions,
         right_of_way=trainer.plan.settings.right_of_way,
         alone=trainer.plan.settings.alone,
     )

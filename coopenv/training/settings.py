@@ -216,6 +216,14 @@ class TrainingPlan:
         """Every override of the scenario by its dotted key."""
         return {**self.settings.scenario, **(self.overrides or {})}
 
+    @property
+    def portable(self) -> Settings:
+        """The settings with all overrides as they are beside the agent, with references to copies there."""
+        actions = self.settings.actions
+        actions = beside(actions, Path.cwd(), {}) if is_reference(actions) else actions
+        changed = {"scenario": _with_code_beside(self.all_overrides, {}), "actions": actions}
+        return self.settings.model_copy(update=changed)
+
     def watched(self) -> "list[TrainingPlan]":
         """Return the plan in each environment whose worlds are learnt in."""
         elsewhere = self.settings.clone.elsewhere if self.settings.clone else None
@@ -443,18 +451,11 @@ def _movable(text: str, folder: Path, code: dict[str, Path]) -> str:
     return tomlkit.dumps(document)
 
 
-def own_settings(plan: TrainingPlan) -> Settings:
-    """Return the settings of a training as they are beside its agent, with references to copies there."""
-    actions = plan.settings.actions
-    actions = beside(actions, Path.cwd(), {}) if is_reference(actions) else actions
-    return plan.settings.model_copy(update={"scenario": _with_code_beside(plan.all_overrides, {}), "actions": actions})
-
-
 def settings_text(plan: TrainingPlan) -> str:
     """Return the settings of a training, defaults and overrides among them, as TOML."""
     import tomlkit  # of the extra `train`
 
-    return tomlkit.dumps(own_settings(plan).model_dump(mode="json", exclude_none=True))
+    return tomlkit.dumps(plan.portable.model_dump(mode="json", exclude_none=True))
 
 
 def settings_digest(plan: TrainingPlan) -> str:
@@ -502,7 +503,7 @@ def _says(path: Path, plan: TrainingPlan, environment: EnvironmentFile) -> bool:
         settings = read_settings(path, None, Path(environment.name).stem)
     except CoopenvError:
         return False
-    return settings == own_settings(plan)
+    return settings == plan.portable
 
 
 def _is_the_agents(path: Path) -> bool:

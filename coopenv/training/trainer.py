@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from time import monotonic, process_time
 from typing import Any
 
@@ -15,7 +14,7 @@ from stable_baselines3.common.logger import Logger
 from torch import Tensor, nn
 
 from coopenv.api.terms.layout import observation_layout
-from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv, LeanPpo, TanhPolicy, differentiate, outputs
+from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv, LeanPpo, TanhPolicy, network
 from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.base.errors import CoopenvError
 from coopenv.policies import Policy, find_agent, restart
@@ -27,7 +26,7 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.terms import SETTLED_FROM
 from coopenv.training.actions import Steering, actions_of
 from coopenv.training.batches import APART, LEAST_VARIANCE, Arrays, MixedWorlds, NormalisedEnv
-from coopenv.training.memory import RememberingEnv, RememberingPolicy, RememberingPpo, SequencesBuffer
+from coopenv.training.memory import RememberingEnv, RememberingPolicy, SequencesBuffer
 from coopenv.training.settings import Clone, TrainingPlan
 
 
@@ -140,7 +139,7 @@ def watch(
     under_way = np.tile(scenario.acting, worlds)
     steps: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
     while under_way.any():
-        now = len(steps) * kind.kept / scenario.rates.decision
+        now = len(steps) * (kind.choices.kept if kind.choices else 1) / scenario.rates.decision
         report(f"watching {name}: {now:.0f} of {scenario.horizon:g} s")
         action = kind.chosen(driver, observation, scenario)
         tried = action if clone is None else kind.chosen(clone, observation, scenario)
@@ -164,10 +163,10 @@ def regress(
     count: int,
     clone: Clone,
     seed: int,
-    slopes: Callable[[Tensor], None],
+    loss: Callable[[Tensor], Tensor],
     report: Callable[[str], None],
 ) -> None:
-    """Minimise a loss over `count` recorded rows; `slopes` writes its derivatives, for rows by index, into `grad`."""
+    """Minimise a loss, of recorded rows by their indices, over `count` of them."""
     optimiser = torch.optim.Adam(parameters, clone.learning_rate)
     shuffle = torch.Generator().manual_seed(seed)
     for epoch in range(clone.epochs):
@@ -175,7 +174,7 @@ def regress(
         report(f"learning from {clone.agents[0]}: pass {epoch + 1} of {clone.epochs}")
         for rows in torch.randperm(count, generator=shuffle).split(BATCH):
             optimiser.zero_grad()
-            slopes(rows)
+            loss(rows).backward()
             optimiser.step()
 
 
@@ -225,21 +224,24 @@ class Trainer:
         ppo = plan.settings.ppo
         self._scenarios = plan.scenarios(max(1, ppo.vehicles // sum(scenario.acting)))
         self.actions = actions_of(plan.settings.actions, scenario)
-        options: Any = {"autoreset": "disabled" if self.actions.choices else "same_step", "arrays": "numpy"}
-        built = partial(CooperativeVectorEnv, name=plan.environment, threads=threads, **options)
-        parts = [
-            CooperativeSB3VecEnv(self.actions.batch(built(each, num_worlds=count))) for each, count in self._scenarios
+        mode = "disabled" if self.actions.choices else "same_step"
+        batches = [
+            CooperativeVectorEnv(
+                each, plan.environment, num_worlds=count, autoreset=mode, arrays="numpy", threads=threads
+            )
+            for each, count in self._scenarios
         ]
+        parts = [CooperativeSB3VecEnv(self.actions.batch(each)) for each in batches]
         self.rule, rule = (RightOfWay(scenario) if plan.settings.right_of_way else None for _ in range(2))
         self.batch = parts[0] if len(parts) == 1 else MixedWorlds(parts)
-        self.gamma = ppo.discount(scenario) ** self.actions.kept
-        """Discount per action."""
-        self.env = NormalisedEnv(self.batch, ppo, rule, self.gamma)
+        self.env = NormalisedEnv(self.batch, ppo, rule)
         self._rollout = ppo.decisions * self.env.num_envs
         self._share, self.seconds, self.cpu_seconds = 0.0, 0.0, 0.0
+        self.gamma = ppo.discount(scenario) ** self.batch.kept
+        """Discount per action."""
         widths = list(ppo.hidden)
         self.remembering = RememberingEnv(self.env, ppo.memory) if ppo.memory else None
-        algorithm, policy, buffer = (RememberingPpo, RememberingPolicy, SequencesBuffer) if ppo.memory else self.kinds
+        algorithm, policy, buffer = (LeanPpo, RememberingPolicy, SequencesBuffer) if ppo.memory else self.kinds
         self.model: Any = algorithm(
             policy,
             self.remembering or self.env,
@@ -265,7 +267,7 @@ class Trainer:
             device="cpu",
         )
         if self.remembering:
-            self.remembering.cell = self.model.policy.cell
+            self.remembering.cell, self.model.policy.buffer = self.model.policy.cell, self.model.rollout_buffer
         self.model.set_logger(Logger(None, []))
         self.env.settled = plan.settings.start is not None or plan.settings.clone is not None
         self.model.critic_alone = self.env.settled and ppo.critic_first > 0.0
@@ -295,7 +297,6 @@ class Trainer:
             self._imitate(self.plan.settings.clone.model_copy(update={"agent": self.teacher}), report)
         self.env.start()
 
-    @torch.no_grad()
     def _imitate(self, clone: Clone, report: Callable[[str], None]) -> None:
         """Fit the policy to a driver's actions, and the value to the discounted rewards that follow.
 
@@ -312,9 +313,16 @@ class Trainer:
             observations = torch.from_numpy(self.forgetting(env.normalise(raw)))
             values = (env.reward_scale * returns)[:, None]
             targets = [torch.from_numpy(aims.astype(np.float32)) for aims in (actions, values)]
-            slopes = partial(self._differentiate, observations, targets, clone.smoothing)
+
+            def loss(
+                rows: Tensor, seen: Tensor = observations, actions: Tensor = targets[0], values: Tensor = targets[1]
+            ) -> Tensor:
+                acting, valued = (network(layers, seen[rows]) for layers in networks)
+                fit = self.actions.loss(acting, actions[rows], clone.smoothing)
+                return fit + nn.functional.mse_loss(valued, values[rows])
+
             chosen = (part for layers in networks for layer in layers for part in layer.parameters())
-            regress(chosen, len(observations), clone, self.plan.seed, slopes, report)
+            regress(chosen, len(observations), clone, self.plan.seed, loss, report)
         env.looked_at.append(raw)
 
     def _watched(self, clone: Clone, part: int, report: Callable[[str], None]) -> Iterator[tuple[np.ndarray, ...]]:
@@ -325,19 +333,6 @@ class Trainer:
             worlds, start = max(1, clone.episodes * count // all_worlds // clone.rounds), self.plan.seed + APART * place
             rule = RightOfWay(each) if self.rule else None
             yield watch(each, worlds, clone, self.gamma, start, threads, report, self.actions, rule, driving)
-
-    def _differentiate(self, observations: Tensor, targets: list[Tensor], smoothing: float, rows: Tensor) -> None:
-        """Write the derivatives of the losses of policy and value into `grad`.
-
-        Observations are (M, D), normalised, targets (M, A), or (M,) for letters, and (M, 1); `rows` (B,) are the
-        numbers of those that count.
-        """
-        losses = self.actions.loss, Steering().loss
-        for loss, layers, aims in zip(losses, self.model.policy.layers(), targets, strict=True):
-            found = outputs(layers, observations[rows])
-            with torch.enable_grad():
-                loss(found[-1].requires_grad_(), aims[rows], smoothing).backward()
-            differentiate(layers, found, found[-1].grad)
 
     def update(self) -> Status:
         """Collect one rollout and learn from it.

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 
 from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
@@ -32,7 +31,7 @@ try:
     from stable_baselines3.common.buffers import RolloutBuffer
     from stable_baselines3.common.monitor import Monitor
     from stable_baselines3.common.policies import ActorCriticPolicy
-    from stable_baselines3.common.type_aliases import RolloutBufferSamples, Schedule
+    from stable_baselines3.common.type_aliases import RolloutBufferSamples
     from stable_baselines3.common.utils import explained_variance
     from stable_baselines3.common.vec_env import VecEnv
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
@@ -79,6 +78,8 @@ class CooperativeSB3VecEnv(VecEnv):
         """Infos of the last step as `CooperativeVectorEnv` gives them, arrays (num_envs,)."""
         self._recorder = RecordVehicleEpisodes(envs)
         self._driver: Any = getattr(envs, "driver", None)  # of `ChoiceRows`
+        self.kept: int = self._driver.kept if self._driver else 1
+        """Decisions of a step."""
         self._rows = batch.acting if batch.acting.any() else ~batch.acting
         self._outcomes, self._begin = outcome_words(batch.scenario), time.time()
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
@@ -313,24 +314,40 @@ def outputs(layers: Sequence[nn.Linear], rows: Tensor) -> list[Tensor]:
     return found
 
 
-def differentiate(layers: Sequence[nn.Linear], found: Sequence[Tensor], slope: Tensor, through: bool = False) -> Tensor:
-    """Write a loss's derivatives with respect to the parameters of a tanh network into their `grad`.
+class TanhNetwork(torch.autograd.Function):
+    """A tanh network with derivatives in closed form; `apply` it to its layers, rows (rows, D) and its parameters."""
 
-    Args:
-        layers: of the network.
-        found: the result of `outputs`.
-        slope: derivative of the loss with respect to the network's output, (rows, A).
-        through: also return the derivative with respect to the network's input, (rows, D).
-    """
-    for layer, inputs in zip(reversed(layers), reversed(found[:-1]), strict=True):
-        layer.weight.grad, layer.bias.grad = product(slope.t(), inputs.t()), slope.sum(0)
-        if layer is not layers[0]:
-            slope = torch.ops.aten.tanh_backward(product(slope, layer.weight.t()), inputs)
-    return product(slope, layers[0].weight.t()) if through else slope
+    @staticmethod
+    def forward(ctx: Any, layers: Sequence[nn.Linear], rows: Tensor, *parameters: Tensor) -> Tensor:
+        """Return the output (rows, A)."""
+        *ctx.inputs, output = outputs(layers, rows)
+        ctx.layers = layers
+        return output
+
+    @staticmethod
+    def backward(ctx: Any, slope: Tensor) -> Any:
+        """Return a loss's derivatives with respect to rows and parameters, from that with respect to the output."""
+        found = list[Tensor]()
+        for layer, inputs in zip(reversed(ctx.layers), reversed(ctx.inputs), strict=True):
+            found += [slope.sum(0), product(slope.t(), inputs.t())]
+            if layer is not ctx.layers[0]:
+                slope = torch.ops.aten.tanh_backward(product(slope, layer.weight.t()), inputs)
+        through = product(slope, ctx.layers[0].weight.t()) if ctx.needs_input_grad[1] else None
+        return None, through, *reversed(found)
+
+
+def network(layers: Sequence[nn.Linear], rows: Tensor) -> Tensor:
+    """Return the output (rows, A) of a tanh network, which can be differentiated."""
+    parameters = (part for layer in layers for part in (layer.weight, layer.bias))
+    output: Tensor = TanhNetwork.apply(layers, rows, *parameters)
+    return output
 
 
 class TanhPolicy(ActorCriticPolicy):
     """SB3's `MlpPolicy` on the CPU: a tanh network for the mean action or the logits of letters, one for the value."""
+
+    critic_alone = False
+    """Whether the loss depends on the values alone."""
 
     @property
     def spread(self) -> dict[str, nn.Parameter]:
@@ -357,6 +374,15 @@ class TanhPolicy(ActorCriticPolicy):
         actions = distribution.get_actions(deterministic)
         return actions, self.predict_values(obs), distribution.log_prob(actions)
 
+    def evaluate_actions(self, obs: Any, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return values (rows, 1), and logarithms of the actions' densities and entropies (rows,), for the loss."""
+        actor, critic = self.layers()
+        distribution = self.distribution_about(network(actor, obs))
+        log_density, entropy = distribution.log_prob(actions), distribution.entropy()
+        if self.critic_alone:
+            log_density, entropy = log_density.detach(), entropy.detach()
+        return network(critic, obs), log_density, entropy
+
     @torch.no_grad()
     def predict_values(self, obs: Any) -> Tensor:
         """Return values, (rows, 1)."""
@@ -364,72 +390,18 @@ class TanhPolicy(ActorCriticPolicy):
 
 
 class LeanPpo(PPO):
-    """SB3's `PPO` for a `TanhPolicy`, without `clip_range_vf`, `target_kl` and `use_sde`."""
+    """SB3's `PPO` for a `TanhPolicy`, whose critic may learn alone."""
 
     policy: TanhPolicy
     rollout_buffer: ActingRowsBuffer
-    clip_range: Schedule
     critic_alone = False
     """Whether the critic alone learns, and the policy stays as it is."""
     explained = 0.0
     """Share of the variance of the last rollout's returns that the critic explained, over rows that acted."""
-    passes_back = False
-    """Whether the loss's derivatives with respect to the networks' inputs are of use."""
 
-    def pass_back(self, slopes: list[Tensor]) -> None:
-        """Take the derivatives with respect to the inputs (rows, D) of each network that learns."""
-
-    @torch.no_grad()
     def train(self) -> None:
         """Learn from the rollout, and log SB3's figures."""
-        self._update_learning_rate(self.policy.optimizer)
-        clip, buffer = self.clip_range(self._current_progress_remaining), self.rollout_buffer
-        passes = [[self._improve(rows, clip) for rows in buffer.get(self.batch_size)] for _ in range(self.n_epochs)]
-        self._n_updates += self.n_epochs
-        steps = [step for steps in passes for step in steps]
-        figures = {name: float(np.mean([step[name] for step in steps])) for name in steps[0]}
-        figures["approx_kl"] = float(np.mean([step["approx_kl"] for step in passes[-1]]))
-        figures["loss"] = steps[-1]["loss"]
+        self.policy.critic_alone, buffer = self.critic_alone, self.rollout_buffer
+        super().train()
         acted = buffer.swap_and_flatten(buffer.acted).flatten()
         self.explained = float(explained_variance(buffer.values.flatten()[acted], buffer.returns.flatten()[acted]))
-        figures["explained_variance"] = float(explained_variance(buffer.values.flatten(), buffer.returns.flatten()))
-        figures |= {name.removeprefix("log_"): float(v.exp().mean()) for name, v in self.policy.spread.items()}
-        for name, value in {**figures, "clip_range": clip}.items():
-            self.logger.record(f"train/{name}", value)
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-
-    def _improve(self, rows: RolloutBufferSamples, clip: float) -> dict[str, float]:
-        """Take one gradient step on a minibatch; return the figures that SB3 logs of it."""
-        policy, (actor, critic), count = self.policy, self.policy.layers(), len(rows.advantages)
-        advantages, found = rows.advantages, outputs(actor, rows.observations)
-        if count > 1:
-            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-        taken = rows.actions.long().flatten() if isinstance(self.action_space, spaces.Discrete) else rows.actions
-        with torch.enable_grad():  # of the distribution; derivatives of the networks are in closed form
-            output = found[-1].requires_grad_()
-            distribution = policy.distribution_about(output)
-            change = distribution.log_prob(taken) - rows.old_log_prob
-            ratio = change.exp()
-            gain = torch.minimum(advantages * ratio, advantages * ratio.clamp(1.0 - clip, 1.0 + clip)).mean()
-            entropy = distribution.entropy().mean()
-            loss = -gain - self.ent_coef * entropy
-        policy.optimizer.zero_grad()
-        slopes = list[Tensor]()
-        if not self.critic_alone:
-            loss.backward()
-            slopes.append(differentiate(actor, found, output.grad, self.passes_back))
-        found = outputs(critic, rows.observations)
-        excess = found[-1].squeeze(1) - rows.returns
-        weighted = excess.mul(2.0 * self.vf_coef / count).unsqueeze(1)
-        slopes.append(differentiate(critic, found, weighted, self.passes_back))
-        self.pass_back(slopes)
-        figures = {
-            "policy_gradient_loss": -gain.item(),
-            "value_loss": float(excess.square().mean()),
-            "entropy_loss": -entropy.item(),
-            "clip_fraction": float(((ratio - 1.0).abs() > clip).float().mean()),
-            "approx_kl": float((ratio - 1.0 - change).mean()),
-        }
-        nn.utils.clip_grad_norm_(policy.parameters(), self.max_grad_norm, foreach=True)
-        policy.optimizer.step()
-        return {**figures, "loss": loss.item() + self.vf_coef * figures["value_loss"]}
