@@ -157,7 +157,7 @@ class Settings(Section):
     """Longest time of learning, min; a training that it stops depends on the machine and its load."""
     start: str | None = None
     """Learned agent that the training continues, name or folder, with its critic and normalisation."""
-    actions: str = STEERING
+    actions: Annotated[str, Field(pattern=rf"^({STEERING}|{CHOICES}|.+:\w+)$")] = STEERING
     """`steering`: an action of the environment every decision; `choices`: letters of `Choices`, or of a subclass by
     `file.py:Class`, kept for half a second, which stand for decisions in all counts but that of `ppo.gamma`."""
     right_of_way: bool = False
@@ -189,8 +189,6 @@ class Settings(Section):
             raise ValueError("ppo.memory: a clone alone has none, set steps")
         if self.actions != STEERING and (self.right_of_way or self.network):
             raise ValueError(f"actions: '{self.actions}' not with right_of_way, which is theirs already, nor network")
-        if self.actions not in (STEERING, CHOICES) and not is_reference(self.actions):
-            raise ValueError(f"actions: '{self.actions}', expected steering, choices or file.py:Class")
         if self.network and self.alone is not None:
             raise ValueError(f"alone: not with network = '{self.network}'")
         if sum(variation.share for variation in self.variations) > 1.0:

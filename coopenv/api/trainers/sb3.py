@@ -1,8 +1,7 @@
 """Stable-Baselines3: the batch as a native `VecEnv`, rows (world, vehicle), and a faster PPO. Needs the extra `train`.
 
-PPO has the gradients of its networks in closed form. Loss, minibatches, optimiser and random numbers are those of SB3's
-`PPO`, and so are the results, except for rounding. The update takes less CPU time: hardly a graph is recorded, tanh is
-NumPy's, and on AMD matrices are multiplied by oneDNN.
+PPO has the gradients of its networks in closed form; results are those of SB3's `PPO`, except for rounding. The update
+takes less CPU time: tanh is NumPy's, and on AMD matrices are multiplied by oneDNN.
 """
 
 import copy
@@ -303,26 +302,19 @@ def product(rows: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     return nn.functional.linear(rows, weight, bias)
 
 
-def outputs(layers: Sequence[nn.Linear], rows: Tensor) -> list[Tensor]:
-    """Return the inputs (rows, D) of every layer of a tanh network and, last, its output (rows, A)."""
-    found = [rows]
-    for layer in layers:
-        rows = product(rows, layer.weight, layer.bias)
-        if layer is not layers[-1]:
-            np.tanh(rows.numpy(), out=rows.numpy())  # torch's takes ten times as long
-        found.append(rows)
-    return found
-
-
 class TanhNetwork(torch.autograd.Function):
     """A tanh network with derivatives in closed form; `apply` it to its layers, rows (rows, D) and its parameters."""
 
     @staticmethod
     def forward(ctx: Any, layers: Sequence[nn.Linear], rows: Tensor, *parameters: Tensor) -> Tensor:
         """Return the output (rows, A)."""
-        *ctx.inputs, output = outputs(layers, rows)
-        ctx.layers = layers
-        return output
+        ctx.layers, ctx.inputs = layers, list[Tensor]()
+        for layer in layers:
+            ctx.inputs.append(rows)
+            rows = product(rows, layer.weight, layer.bias)
+            if layer is not layers[-1]:
+                np.tanh(rows.numpy(), out=rows.numpy())  # torch's takes ten times as long
+        return rows
 
     @staticmethod
     def backward(ctx: Any, slope: Tensor) -> Any:
@@ -363,30 +355,28 @@ class TanhPolicy(ActorCriticPolicy):
         actor, critic = ([*(part for part in net if isinstance(part, nn.Linear)), end] for net, end in networks)
         return actor, critic
 
-    def distribution_about(self, output: Tensor) -> Any:
-        """Return SB3's distribution of actions for outputs of the first network."""
-        return self.action_dist.proba_distribution(output, *self.spread.values())
+    def _distribution(self, obs: Tensor) -> Any:
+        return self.action_dist.proba_distribution(network(self.layers()[0], obs), *self.spread.values())
 
     @torch.no_grad()
     def forward(self, obs: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         """Return actions (rows, A) or letters (rows,), values (rows, 1) and logarithms of their densities (rows,)."""
-        distribution = self.distribution_about(outputs(self.layers()[0], obs)[-1])
+        distribution = self._distribution(obs)
         actions = distribution.get_actions(deterministic)
         return actions, self.predict_values(obs), distribution.log_prob(actions)
 
     def evaluate_actions(self, obs: Any, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return values (rows, 1), and logarithms of the actions' densities and entropies (rows,), for the loss."""
-        actor, critic = self.layers()
-        distribution = self.distribution_about(network(actor, obs))
+        distribution = self._distribution(obs)
         log_density, entropy = distribution.log_prob(actions), distribution.entropy()
         if self.critic_alone:
             log_density, entropy = log_density.detach(), entropy.detach()
-        return network(critic, obs), log_density, entropy
+        return network(self.layers()[1], obs), log_density, entropy
 
     @torch.no_grad()
     def predict_values(self, obs: Any) -> Tensor:
         """Return values, (rows, 1)."""
-        return outputs(self.layers()[1], obs)[-1]
+        return network(self.layers()[1], obs)
 
 
 class LeanPpo(PPO):
