@@ -17,7 +17,7 @@ from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import Scenario
 
 STEERING, CHOICES = "steering", "choices"
-"""What a policy chooses, in settings and cards; or an import path of a subclass of `Choices`."""
+"""Kinds of actions in settings and cards; another one is an import path of a subclass of `Choices`."""
 KEPT = 0.5
 """Time (s) for which a choice is kept."""
 OFFSETS, PACES = (0.0, 0.4, -0.4), (1.0, 0.5)

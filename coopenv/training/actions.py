@@ -1,4 +1,4 @@
-"""What a policy in training chooses: steering, once a decision, or letters of an alphabet, each kept for a while."""
+"""Actions of a policy in training: steering, once a decision, or letters of an alphabet, each kept for a while."""
 
 from typing import Any
 

@@ -83,43 +83,34 @@ def scenario_digest(scenario: Scenario) -> str:
     return sha256(text.encode()).hexdigest()[:16]
 
 
-def _network(trainer: Trainer, digest: str) -> NetworkCard:
-    observation, action = layout_tables(observation_layout(trainer.scenario))
-    settings = settings_of_meaning(trainer.scenario, observation)
+def _network(trainer: Trainer | SetTrainer, digest: str) -> NetworkCard:
+    plan, more = trainer.plan, dict[str, Any]()
+    observation, action, settings = {}, {}, {}  # a network over sets reads any
+    if isinstance(trainer, SetTrainer):
+        seen = trainer.seen
+    else:
+        observation, action = layout_tables(observation_layout(trainer.scenario))
+        settings = settings_of_meaning(trainer.scenario, observation)
+        fields = {name: slice(f.start, f.stop) for name, f in observation.items()}
+        fields.pop("time_left", None)  # goes on for vehicles that have arrived
+        seen = {name: trainer.env.seen(columns) for name, columns in fields.items()}
+        more = {"right_of_way": plan.settings.right_of_way, "alone": plan.settings.alone}
     return NetworkCard(
         weights=WEIGHTS_FILE,
         sha256=digest,
         layout=layout_hash(observation, action, settings),
-        clip=trainer.plan.settings.ppo.observation_clip,
+        clip=plan.settings.ppo.observation_clip,
         observation=observation,
         action=action,
         settings=settings,
-        seen={
-            name: trainer.env.seen(slice(field.start, field.stop))
-            for name, field in observation.items()
-            if name != "time_left"  # goes on for vehicles that have arrived
-        },
-        actions=trainer.plan.portable.actions,
-        right_of_way=trainer.plan.settings.right_of_way,
-        alone=trainer.plan.settings.alone,
+        seen=seen,
+        actions=plan.portable.actions,
+        **more,
     )
 
 
 def _card(trainer: Trainer | SetTrainer, environment: EnvironmentFile, results: Sequence[Result], digest: str) -> str:
     plan = trainer.plan
-    if isinstance(trainer, SetTrainer):
-        card = NetworkCard(
-            weights=WEIGHTS_FILE,
-            sha256=digest,
-            layout=layout_hash({}, {}, {}),  # it reads any
-            clip=plan.settings.ppo.observation_clip,
-            observation={},
-            action={},
-            settings={},
-            seen=trainer.seen,
-        )
-    else:
-        card = _network(trainer, digest)
     arm = f", arm {plan.arm}" if plan.arm else ""
     others = [each.environment for each in plan.watched() if each is not plan]
     begun = f"Clone of {trainer.teacher}" if plan.settings.steps == 0 else "PPO"
@@ -129,7 +120,9 @@ def _card(trainer: Trainer | SetTrainer, environment: EnvironmentFile, results: 
         "kind": "learned",
         "entry": sets.ENTRY if isinstance(trainer, SetTrainer) else ENTRY,
         "environments": [environment.name, *others],
-        "network": _with_rows(card.model_dump(mode="json", exclude_none=True), "observation", "action"),
+        "network": _with_rows(
+            _network(trainer, digest).model_dump(mode="json", exclude_none=True), "observation", "action"
+        ),
         "training": {
             # trains the same once more, in the agent's folder
             "command": join(

@@ -249,7 +249,7 @@ def test_an_alphabet_of_ones_own_goes_with_the_agent(tmp_path: Path, monkeypatch
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"actions": "letters"}, r"actions: 'letters', expected steering, choices or file\.py:Class"),
+        ({"actions": "letters"}, r"actions\n  String should match pattern .*steering|choices"),
         ({"right_of_way": True}, r"actions: 'choices' not with right_of_way"),
         ({"actions": "coopenv.policies.look_ahead:LookAhead"}, r"LookAhead is no subclass of .*Choices"),
         ({"clone": Clone(agent="route_follower")}, r"clone\.agent: route_follower does not choose letters of actions"),
