@@ -110,7 +110,7 @@ def _network(trainer: Trainer | SetTrainer, digest: str) -> NetworkCard:
 
 
 def _card(trainer: Trainer | SetTrainer, environment: EnvironmentFile, results: Sequence[Result], digest: str) -> str:
-    plan = trainer.plan
+    plan, card = trainer.plan, _network(trainer, digest)
     arm = f", arm {plan.arm}" if plan.arm else ""
     others = [each.environment for each in plan.watched() if each is not plan]
     begun = f"Clone of {trainer.teacher}" if plan.settings.steps == 0 else "PPO"
@@ -120,9 +120,7 @@ def _card(trainer: Trainer | SetTrainer, environment: EnvironmentFile, results: 
         "kind": "learned",
         "entry": sets.ENTRY if isinstance(trainer, SetTrainer) else ENTRY,
         "environments": [environment.name, *others],
-        "network": _with_rows(
-            _network(trainer, digest).model_dump(mode="json", exclude_none=True), "observation", "action"
-        ),
+        "network": _with_rows(card.model_dump(mode="json", exclude_none=True), "observation", "action"),
         "training": {
             # trains the same once more, in the agent's folder
             "command": join(
