@@ -65,7 +65,8 @@ class CooperativeSB3VecEnv(VecEnv):
 
     def __init__(self, envs: CooperativeVectorEnv) -> None:
         """Show a batch with the autoreset mode SAME_STEP and NumPy arrays; `make_sb3_vec_env` builds one by name."""
-        self.envs, batch = envs, envs.unwrapped
+        self.envs = envs
+        batch = envs.unwrapped
         self.scenario, self.vehicles = batch.scenario, batch.vehicles
         self.render_mode, self.metadata = "rgb_array", envs.metadata
         self.acted = np.zeros(envs.num_envs, dtype=bool)
