@@ -23,8 +23,12 @@ class Steering:
         """Load an agent to learn from. Raises CoopenvError: it cannot drive there, or does not choose such actions."""
         return load_agent(agent, scenario)
 
-    def batch(self, env: CooperativeVectorEnv, teacher: Policy | None = None) -> Any:
-        """Return a batch of the autoreset mode `disabled` or `same_step` with these actions, to watch a teacher in."""
+    def batch(
+        self, scenario: Scenario, name: str, worlds: int, threads: int | None, teacher: Policy | None = None
+    ) -> Any:
+        """Return a batch with these actions to learn in, or to watch a teacher in."""
+        mode = "disabled" if teacher or self.choices else "same_step"
+        env = CooperativeVectorEnv(scenario, name, num_worlds=worlds, autoreset=mode, arrays="numpy", threads=threads)
         return env
 
     def chosen(self, policy: Policy, observations: np.ndarray, scenario: Scenario) -> np.ndarray:
@@ -57,9 +61,10 @@ class Letters(Steering):
             raise CoopenvError(f"clone.agent: {agent} does not choose letters of actions = '{self._name}'")
         return policy
 
-    def batch(self, env: CooperativeVectorEnv, teacher: Policy | None = None) -> Any:
+    def batch(self, scenario: Scenario, *options: Any) -> Any:
         """See `Steering.batch`; a teacher drives, and so knows which letters are taken."""
-        return ChoiceRows(env, choices_of(teacher) or load_choices(self._name, env.scenario))
+        driver = choices_of(options[-1]) or load_choices(self._name, scenario)
+        return ChoiceRows(super().batch(scenario, *options), driver)
 
     def chosen(self, policy: Any, observations: np.ndarray, scenario: Scenario) -> np.ndarray:
         """See `Steering.chosen`."""

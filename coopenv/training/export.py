@@ -85,7 +85,7 @@ def scenario_digest(scenario: Scenario) -> str:
 
 def _network(trainer: Trainer | SetTrainer, digest: str) -> NetworkCard:
     plan, more = trainer.plan, dict[str, Any]()
-    observation, action, settings = {}, {}, {}  # a network over sets reads any
+    observation, action, settings = (dict[str, Any]() for _ in range(3))  # a network over sets reads any
     if isinstance(trainer, SetTrainer):
         seen = trainer.seen
     else:

@@ -100,11 +100,11 @@ class SetTrainer:
         widths = tuple(rows.shape[-1] for rows in inputs[1:-1])
         network = SetNetwork(alone.shape[1], widths, self.plan.settings.ppo.hidden[0])
 
-        def loss(rows: torch.Tensor) -> torch.Tensor:
-            *seen, steering = (values[rows] for values in inputs)
+        def loss(*columns: torch.Tensor) -> torch.Tensor:
+            *seen, steering = columns
             return nn.functional.smooth_l1_loss(network(*seen), steering, beta=0.1)
 
-        regress(network.parameters(), len(alone), self.clone, self.plan.seed, loss, report)
+        regress(network.parameters(), inputs, self.clone, self.plan.seed, loss, report)
         learnt = {name: values.numpy() for name, values in network.state_dict().items()}
         self.tensors = {name: np.asarray(values, dtype=np.float32) for name, values in {**scales, **learnt}.items()}
         self.mean_action = SetDriver(self.scenario, self.tensors)

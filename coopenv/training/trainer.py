@@ -1,7 +1,7 @@
 """One training: the batch, Stable-Baselines3's PPO on it, and its progress. Needs the extra `train`."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from time import monotonic, process_time
@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from coopenv.api.terms.layout import observation_layout
 from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv, LeanPpo, TanhPolicy, network
-from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.base.errors import CoopenvError
 from coopenv.policies import Policy, find_agent, restart
 from coopenv.policies.alone import Alone
@@ -131,9 +130,7 @@ def watch(
     """
     kind, name, noise = kind or Steering(), settings.agents[0], np.random.default_rng(seed)
     driver = kind.teacher(name, scenario)
-    env = kind.batch(
-        CooperativeVectorEnv(scenario, "clone", num_worlds=worlds, autoreset="disabled", threads=threads), driver
-    )
+    env = kind.batch(scenario, "clone", worlds, threads, driver)
     observation, _ = env.reset(seed=seed)
     restart(driver, np.ones(env.num_envs, dtype=bool))
     under_way = np.tile(scenario.acting, worlds)
@@ -160,21 +157,21 @@ def watch(
 
 def regress(
     parameters: Iterable[nn.Parameter],
-    count: int,
+    columns: Sequence[Tensor],
     clone: Clone,
     seed: int,
-    loss: Callable[[Tensor], Tensor],
+    loss: Callable[..., Tensor],
     report: Callable[[str], None],
 ) -> None:
-    """Minimise a loss, of recorded rows by their indices, over `count` of them."""
+    """Minimise a loss, a function of the recorded columns (rows, ...), over minibatches of rows."""
     optimiser = torch.optim.Adam(parameters, clone.learning_rate)
     shuffle = torch.Generator().manual_seed(seed)
     for epoch in range(clone.epochs):
         optimiser.param_groups[0]["lr"] = clone.learning_rate * (1.0 - epoch / clone.epochs)
         report(f"learning from {clone.agents[0]}: pass {epoch + 1} of {clone.epochs}")
-        for rows in torch.randperm(count, generator=shuffle).split(BATCH):
+        for rows in torch.randperm(len(columns[0]), generator=shuffle).split(BATCH):
             optimiser.zero_grad()
-            loss(rows).backward()
+            loss(*(values[rows] for values in columns)).backward()
             optimiser.step()
 
 
@@ -224,14 +221,8 @@ class Trainer:
         ppo = plan.settings.ppo
         self._scenarios = plan.scenarios(max(1, ppo.vehicles // sum(scenario.acting)))
         self.actions = actions_of(plan.settings.actions, scenario)
-        mode = "disabled" if self.actions.choices else "same_step"
-        batches = [
-            CooperativeVectorEnv(
-                each, plan.environment, num_worlds=count, autoreset=mode, arrays="numpy", threads=threads
-            )
-            for each, count in self._scenarios
-        ]
-        parts = [CooperativeSB3VecEnv(self.actions.batch(each)) for each in batches]
+        batches = [self.actions.batch(each, plan.environment, count, threads) for each, count in self._scenarios]
+        parts = [CooperativeSB3VecEnv(batch) for batch in batches]
         self.rule, rule = (RightOfWay(scenario) if plan.settings.right_of_way else None for _ in range(2))
         self.batch = parts[0] if len(parts) == 1 else MixedWorlds(parts)
         self.env = NormalisedEnv(self.batch, ppo, rule)
@@ -304,6 +295,11 @@ class Trainer:
         all actions, so that corrections of deviations are recorded (Laskey et al. 2017).
         """
         env, networks, watched = self.env, self.model.policy.layers(), list[tuple[np.ndarray, ...]]()
+
+        def loss(seen: Tensor, actions: Tensor, values: Tensor) -> Tensor:
+            acting, valued = (network(layers, seen) for layers in networks)
+            return self.actions.loss(acting, actions, clone.smoothing) + nn.functional.mse_loss(valued, values)
+
         for part in range(clone.rounds):
             watched += self._watched(clone, part, report)
             raw, actions, returns, _ = (np.concatenate(column) for column in zip(*watched, strict=True))
@@ -313,16 +309,8 @@ class Trainer:
             observations = torch.from_numpy(self.forgetting(env.normalise(raw)))
             values = (env.reward_scale * returns)[:, None]
             targets = [torch.from_numpy(aims.astype(np.float32)) for aims in (actions, values)]
-
-            def loss(
-                rows: Tensor, seen: Tensor = observations, actions: Tensor = targets[0], values: Tensor = targets[1]
-            ) -> Tensor:
-                acting, valued = (network(layers, seen[rows]) for layers in networks)
-                fit = self.actions.loss(acting, actions[rows], clone.smoothing)
-                return fit + nn.functional.mse_loss(valued, values[rows])
-
             chosen = (part for layers in networks for layer in layers for part in layer.parameters())
-            regress(chosen, len(observations), clone, self.plan.seed, loss, report)
+            regress(chosen, (observations, *targets), clone, self.plan.seed, loss, report)
         env.looked_at.append(raw)
 
     def _watched(self, clone: Clone, part: int, report: Callable[[str], None]) -> Iterator[tuple[np.ndarray, ...]]:
