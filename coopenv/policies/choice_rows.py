@@ -42,13 +42,12 @@ class ChoiceRows(VectorWrapper):
         self.single_action_space: Any = spaces.Discrete(len(self.driver.alphabet))
         self.action_space = batch_space(self.single_action_space, env.num_envs)
         self.metadata = {**env.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}
-        self._observation = np.empty(0)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start new episodes in all worlds."""
-        self._observation, infos = self.env.reset(seed=seed, options=options)
+        observation, infos = self.env.reset(seed=seed, options=options)
         restart(self.driver, np.ones(self.num_envs, dtype=bool))
-        return self._observation, infos
+        return observation, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Follow the letters, (num_envs,) whole numbers of the alphabet, for `driver.kept` decisions.
@@ -57,29 +56,30 @@ class ChoiceRows(VectorWrapper):
             CoopenvError: no `reset` came before.
             ActionError: the letters have another shape, or one is none of the alphabet.
         """
-        if not self._observation.size:
-            raise CoopenvError("ChoiceRows.step: call reset() first")
+        batch = cast(CooperativeVectorEnv, self.env.unwrapped)
+        batch.engine.check_begun("ChoiceRows.step")
         letters, most = np.asarray(actions), len(self.driver.alphabet) - 1
         whole = letters.shape == (self.num_envs,) and letters.dtype.kind in "iu"
         if not whole or ((letters < 0) | (letters > most)).any():
             raise ActionError(f"expected ({self.num_envs},) whole numbers from 0 to {most}, one letter per row")
         self.driver.take(letters)
-        rewards, terms, last = np.zeros(self.num_envs), dict[str, Any](), self._observation
+        rewards, terms, last = np.zeros(self.num_envs), dict[str, Any](), np.empty(0)
+        observation = batch.engine.view("observation").reshape(self.num_envs, -1).copy()
         acted, terminated, truncated = (np.zeros(self.num_envs, dtype=bool) for _ in range(3))
         for _ in range(self.driver.kept):
-            driven = decide(self.driver, self._observation, self.env.single_action_space.shape[0])  # type: ignore[index]
-            self._observation, reward, ends, cut, infos = self.env.step(driven.astype(np.float32))
-            last = np.where((terminated | truncated)[:, None], last, self._observation)
+            driven = decide(self.driver, observation, batch.scenario.action_size)
+            observation, reward, ends, cut, infos = self.env.step(driven.astype(np.float32))
+            last = np.where((terminated | truncated)[:, None], last, observation) if last.size else observation
             rewards += reward
             terms = {n: terms.get(n, 0.0) + infos["alive"] * part for n, part in infos["reward_terms"].items()}
             acted |= infos["alive"]
             terminated |= ends
             truncated |= cut & ~terminated
         infos = {**infos, "alive": acted, "reward_terms": terms}
-        ended, batch = terminated | truncated, cast(CooperativeVectorEnv, self.env.unwrapped)
+        ended = terminated | truncated
         over = np.repeat(batch.engine.view("over") != 0, batch.vehicles)
         final = {"final_obs": last, "final_info": infos, "_final_obs": ended, "_final_info": ended}
         if over.any():
-            self._observation, infos = self.env.reset(options={"reset_mask": over})
+            observation, infos = self.env.reset(options={"reset_mask": over})
             restart(self.driver, over)
-        return self._observation, rewards, terminated, truncated, {**infos, **(final if ended.any() else {})}
+        return observation, rewards, terminated, truncated, {**infos, **(final if ended.any() else {})}

@@ -4,13 +4,20 @@ A rule, or a learned policy, chooses a letter of the alphabet; the driver steers
 with an effect, and a clone of a rule is exact: letters are classes.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import absolute_reference
+from coopenv.policies.loader import load_agent
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import Scenario
 
+STEERING, CHOICES = "steering", "choices"
+"""Kinds of actions in settings and cards; another one is an import path of a subclass of `Choices`."""
 KEPT = 0.5
 """Time (s) for which a choice is kept."""
 OFFSETS, PACES = (0.0, 0.4, -0.4), (1.0, 0.5)
@@ -45,6 +52,8 @@ class Choices(RouteFollower):
 
     needs: tuple[str, ...] = ("message_position", "message_forward", "message_mask", "route_heading")
     remembers = 2  # decisions until the next choice, and the present letter
+    chooser: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    """Letters of a learned policy in place of `choose`, from observations and flags (rows,) of the rows that choose."""
 
     def __init__(self, scenario: Scenario) -> None:
         """See `Driver`."""
@@ -67,6 +76,23 @@ class Choices(RouteFollower):
         """Return the next letters, (rows,), from observations and the present letters: here those of the route."""
         return np.zeros(len(observations), dtype=int)
 
+    def letters(self, observations: np.ndarray) -> np.ndarray:
+        """Return the letters, (rows,), that it chooses where all rows choose now; none is taken."""
+        before, present = self._reported, self.memory(observations)[1]
+        seen = np.concatenate([observations, self.leaps(observations)], axis=1)
+        self._reported = before  # the jumps of this decision are found once more on driving
+        return self._chosen(seen, present, np.ones(len(seen), dtype=bool))
+
+    def _chosen(self, observations: np.ndarray, present: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        if self.chooser:
+            return self.chooser(observations[:, : self.layout.size], rows)
+        return self.choose(observations, present)
+
+    def matches(self, other: "Choices | None") -> bool:
+        """Return whether letters mean the same to another driver."""
+        meaning = [(one.alphabet, one.kept, type(one).follow) for one in (self, other) if one]
+        return meaning[:1] == meaning[1:]
+
     def take(self, letters: np.ndarray) -> None:
         """Follow letters, (rows,), for the next `kept` decisions in place of choices of its own."""
         left, letter = self.memory(letters)
@@ -77,7 +103,7 @@ class Choices(RouteFollower):
         left, letter = self.memory(observations)
         due = left == 0
         if due.any():
-            letter[due] = self.choose(observations, letter)[due]
+            letter[due] = self._chosen(observations, letter, due)[due]
         left[due] = self.kept
         left -= 1
         return self.follow(observations, letter)
@@ -111,3 +137,22 @@ class Choices(RouteFollower):
         speed = np.clip(self._their_speed[vehicle, sender] + GAIN * along, SLOWEST, self.cruise)
         speed = np.where(np.abs(across) > NEAR, np.maximum(speed, self.cruise / 2.0), speed)
         return serves, np.arctan2(ahead[:, 1], ahead[:, 0]) + turn, speed
+
+
+def load_choices(actions: str, scenario: Scenario, folder: Path | None = None) -> Choices:
+    """Return the driver of an alphabet: of `choices`, or of a reference to a subclass, from a folder (None: here).
+
+    Raises:
+        CoopenvError: there is no such subclass, or it cannot drive in this scenario.
+    """
+    own = f"{Choices.__module__}:{Choices.__name__}" if actions == CHOICES else absolute_reference(actions, folder)
+    found = choices_of(load_agent(own, scenario))
+    if found is None:
+        raise CoopenvError(f"actions: {actions} is no subclass of {Choices.__module__}.Choices")
+    return found
+
+
+def choices_of(policy: Any) -> Choices | None:
+    """Return the driver with the alphabet of a policy that chooses letters, None for others."""
+    found = getattr(policy, CHOICES, policy)
+    return found if isinstance(found, Choices) else None

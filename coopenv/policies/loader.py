@@ -60,6 +60,8 @@ class NetworkCard(Section):
     """Settings of the scenario, by dotted key, that define the meaning of the entries beside these tables."""
     seen: dict[str, tuple[float, float]] = Field(default={})
     """Between which values nearly all entries of a field lay in training, by its name."""
+    actions: str = "steering"
+    """`choices`, or a reference to a subclass of `Choices`: outputs are logits of its letters."""
     right_of_way: bool = False
     """Actions keep to the rule `RightOfWay`."""
     alone: str | None = None

@@ -28,8 +28,11 @@ class Memory:
             self.state = np.zeros((len(mask), self.state.shape[1]), dtype=np.float32)
         self.state = np.where(mask[:, None], np.float32(0.0), self.state)
 
-    def __call__(self, seen: np.ndarray) -> np.ndarray:
-        """Remember normalised observations (rows, D), and return them with the new state beside, (rows, D + M)."""
+    def __call__(self, seen: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """Remember normalised observations (rows, D), and return them with the new state beside, (rows, D + M).
+
+        With flags of `rows`, (rows,), the others remember nothing of it.
+        """
         if len(seen) != len(self.state):
             self.reset(np.ones(len(seen), dtype=bool))
         read, kept = (
@@ -38,5 +41,6 @@ class Memory:
         )
         opened, stays = (1.0 / (1.0 + np.exp(-(read[gate] + kept[gate]))) for gate in (0, 1))
         fresh = np.tanh(read[2] + opened * kept[2])
-        self.state = (fresh + stays * (self.state - fresh)).astype(np.float32)
+        new = (fresh + stays * (self.state - fresh)).astype(np.float32)
+        self.state = new if rows is None else np.where(rows[:, None], new, self.state)
         return np.concatenate([seen, self.state], axis=1)

@@ -3,10 +3,11 @@
 import json
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
@@ -15,6 +16,7 @@ from safetensors.numpy import load
 from coopenv.api.terms.layout import Layout, observation_layout, settings_of_meaning
 from coopenv.base.errors import AgentWarning, CoopenvError
 from coopenv.policies.alone import Alone
+from coopenv.policies.choices import STEERING, Choices, load_choices
 from coopenv.policies.loader import NetworkCard, NetworkColumn
 from coopenv.policies.look_ahead import LookAhead
 from coopenv.policies.memory import MEMORY, PARTS, Memory
@@ -72,7 +74,39 @@ class RightOfWay:
         return found
 
 
-class Network:
+class NetworkPolicy:
+    """A policy by the outputs of a network: actions, or logits of letters that a driver follows, under rules."""
+
+    def __init__(
+        self, choices: Choices | None, rules: Sequence[RightOfWay | Alone], tensors: Mapping[str, np.ndarray]
+    ) -> None:
+        """Begin with an empty memory, if the tensors of the agent's weights have one."""
+        self.choices, self._rules = choices, rules
+        self._memory = Memory(tensors) if f"{MEMORY}{PARTS[0]}" in tensors else None
+        if choices:
+            choices.chooser = self.chosen
+        self._parts: list[Any] = [part for part in (*rules, self._memory, choices) if part]
+        self.agents: list[str] = next((part.agents for part in self._parts if getattr(part, "agents", ())), [])
+        """Names of the vehicles in the order of rows, where a rule or a driver needs the rows of all."""
+
+    def chosen(self, observations: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """Return the most likely actions, (rows, A), or letters, (rows,); flags of `rows`, (rows,): see `Memory`."""
+        raise NotImplementedError
+
+    def reset(self, mask: np.ndarray) -> None:
+        """Begin new episodes in the rows of a mask (rows,), bool."""
+        for part in self._parts:
+            part.reset(mask)
+
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        """Return the actions without exploration, (rows, A) in [-1, 1], for flat observations, (rows, D)."""
+        actions = self.choices(observations) if self.choices else self.chosen(observations)
+        for rule in self._rules:
+            actions = rule(np.asarray(observations, dtype=np.float32), actions)
+        return actions
+
+
+class Network(NetworkPolicy):
     """The mean action of a network that `coopenv train` exported; agrees with torch's to rounding.
 
     It finds its fields by their names and reads larger scales as its own: environments may show more than in training.
@@ -112,38 +146,31 @@ class Network:
         self._clip = np.float32(network.clip)
         tensors = load_weights(path, network.sha256)
         tensors = {name: values for name, values in tensors.items() if not name.startswith(CRITIC)}
-        depth = _depth_of(path, tensors, len(self._columns), len(action))
-        self._memory = Memory(tensors) if f"{MEMORY}{PARTS[0]}" in tensors else None
+        rules: list[RightOfWay | Alone] = [RightOfWay(scenario)] if network.right_of_way else []
+        rules += [Alone(scenario, network.alone)] if network.alone is not None else []
+        choices = None if network.actions == STEERING else load_choices(network.actions, scenario, folder)
+        outputs = len(choices.alphabet) if choices else len(action)
+        depth = _depth_of(path, tensors, len(self._columns), outputs, spread=not choices)
+        super().__init__(choices, rules, tensors)
         self._mean, self._std = tensors["observation.mean"], tensors["observation.std"]
         self._layers = [(tensors[f"layers.{i}.weight"].T.copy(), tensors[f"layers.{i}.bias"]) for i in range(depth)]
         self._name, self._seen, self._rows = folder.resolve().name, dict(network.seen), 0
         self._places = {name: slice(observation[name].start, observation[name].stop) for name in self._seen}
         self._outside = dict.fromkeys(self._seen, 0.0)
-        self._rules: list[RightOfWay | Alone] = [RightOfWay(scenario)] if network.right_of_way else []
-        self._rules += [Alone(scenario, network.alone)] if network.alone is not None else []
-        self.agents = next((rule.agents for rule in self._rules if rule.agents), [])
-        """Names of the vehicles in the order of rows, where a rule needs the rows of all."""
 
-    def reset(self, mask: np.ndarray) -> None:
-        """Begin new episodes in the rows of a mask."""
-        for part in (*self._rules, *([self._memory] if self._memory else [])):
-            part.reset(mask)
-
-    def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Return the actions, (rows, A) in [-1, 1], for flat observations, (rows, D)."""
+    def chosen(self, observations: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """See `NetworkPolicy.chosen`."""
         seen = np.clip(observations * self._factor, -1.0, 1.0)
         if self._seen:
             self._compare_with_training(seen[seen.any(axis=1)])
         scaled = (seen[:, self._columns] - self._mean) / self._std
         values = np.clip(scaled, -self._clip, self._clip).astype(np.float32)
-        values = self._memory(values) if self._memory else values
+        values = self._memory(values, rows) if self._memory else values
         for weight, bias in self._layers[:-1]:
             values = np.tanh(values @ weight + bias)
         weight, bias = self._layers[-1]
-        actions = np.asarray(np.clip(values @ weight + bias, -1.0, 1.0))
-        for rule in self._rules:
-            actions = rule(np.asarray(observations, dtype=np.float32), actions)
-        return actions
+        values = values @ weight + bias
+        return np.asarray(np.argmax(values, axis=1) if self.choices else np.clip(values, -1.0, 1.0))
 
     def _compare_with_training(self, observations: np.ndarray) -> None:
         """Warn, once, where many entries of a field lie beyond those of the training."""
@@ -195,12 +222,12 @@ def load_weights(path: Path, digest: str) -> dict[str, np.ndarray]:
     return tensors
 
 
-def _depth_of(path: Path, tensors: Mapping[str, np.ndarray], inputs: int, outputs: int) -> int:
+def _depth_of(path: Path, tensors: Mapping[str, np.ndarray], inputs: int, outputs: int, spread: bool) -> int:
     """Return the number of layers. Raises CoopenvError: the weights are not those of a policy of such a width."""
     width = tensors[f"{MEMORY}{PARTS[-1]}"].size // 3 if f"{MEMORY}{PARTS[-1]}" in tensors else 0
     sizes = ((3 * width, inputs), (3 * width, width), (3 * width,), (3 * width,)) if width else ()
     remembered = {f"{MEMORY}{part}": shape for part, shape in zip(PARTS, sizes, strict=False)}
-    names = {"observation.mean", "observation.std", "log_std", *remembered}
+    names = {"observation.mean", "observation.std", *(["log_std"] if spread else []), *remembered}
     depth = (len(tensors) - len(names)) // 2
     expected = names | {f"layers.{i}.{part}" for i in range(depth) for part in ("weight", "bias")}
     if set(tensors) != expected or depth < 1:

@@ -411,6 +411,16 @@ class RouteFollower(Driver):
         if len(self._last[0]) == len(mask):
             self._last[0][mask], self._last[-1][mask] = False, 0.0
 
+    @property
+    def state(self) -> list[np.ndarray]:
+        """Copies of what it remembers of every row; they can be set."""
+        return [values.copy() for values in (self._memory, *self._reported, *self._last)]
+
+    @state.setter
+    def state(self, state: Sequence[np.ndarray]) -> None:
+        self._memory, received, place, age, leapt, *last = state
+        self._reported, self._last = (received, place, age, leapt), tuple(last)
+
     def going(self, observations: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Return the arc lengths, (rows, P) in m, at times (P,) in s of going on at full speed."""
         speed = np.full((len(observations), 1), self.cruise)

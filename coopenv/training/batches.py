@@ -90,7 +90,7 @@ class NormalisedEnv(VecEnvWrapper):
         )
         self.statistics = RunningMeanStd(shape=shape or ())
         self._clip, self._scale = ppo.observation_clip, ppo.reward_scale
-        self._gamma = ppo.discount(venv.scenario)
+        self._gamma = ppo.discount(venv.scenario) ** venv.kept
         self.spread = RunningMeanStd(shape=())
         """Running mean and variance of discounted returns, in the units of the scenario."""
         self.returns = np.zeros(venv.num_envs)

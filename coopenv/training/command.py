@@ -7,7 +7,7 @@ while writing keeps the one before.
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -33,11 +33,12 @@ from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE, che
 from coopenv.policies.network import RightOfWay
 from coopenv.scenario import Scenario
 from coopenv.sources.sources import open_simulation
+from coopenv.training.actions import actions_of
 from coopenv.training.batches import Arrays
 from coopenv.training.export import EXPORTED, check_onnx, export
 from coopenv.training.ranking import Figures, Ranking, figures_of
 from coopenv.training.sets import SetTrainer
-from coopenv.training.settings import TrainingPlan, check_settings, environment_file
+from coopenv.training.settings import Settings, TrainingPlan, check_settings, environment_file
 from coopenv.training.trainer import DivergedError, Status, Trainer, tensors_of
 
 NAMES = (*EXPORTED, CHECKPOINT_FILE, *CARD_FILES)
@@ -74,6 +75,8 @@ class Course(BaseModel):
     """Figures in worlds for validation, a row per look."""
     drivers: dict[str, Figures] = Field(default_factory=dict)
     """Figures of other drivers, and of the clone, in the held-out worlds of the end."""
+    teacher: str = ""
+    """The agent that is cloned, if any."""
     best: dict[str, Any] = Field(default_factory=dict, exclude=True)
     """Tensors of the policy of the best row of the curve."""
 
@@ -105,7 +108,7 @@ def possible(plan: TrainingPlan) -> Scenario:
     if not any(scenario.acting):
         raise CoopenvError(f"{plan.environment}: all motion is prescribed or has a driver, there is nothing to learn")
     if plan.settings.start is not None:
-        tensors_of(plan.settings.start, scenario, plan.settings.ppo.observation_clip)
+        tensors_of(plan.settings.start, scenario, plan.settings.ppo.observation_clip, plan.settings.actions)
     for name in plan.settings.evaluation.drivers:
         check_agent(name, "driver (evaluation.drivers)")
     try:
@@ -120,8 +123,9 @@ def possible(plan: TrainingPlan) -> Scenario:
     for own in plan.watched():
         try:
             for each, _ in own.scenarios():
-                if plan.settings.clone is not None:
-                    load_agent(plan.settings.clone.agent, each)
+                actions = actions_of(plan.settings.actions, each)
+                for name in plan.settings.clone.agents if plan.settings.clone else ():
+                    actions.teacher(name, each)
         except CoopenvError as error:
             if own is plan:
                 raise
@@ -165,7 +169,10 @@ def train(
             or something cannot be written; the last checkpoint stays.
     """
     report, path = reports or Reports(), out / CHECKPOINT_FILE
-    scenario, environment = possible(plan), environment_file(plan.environment, plan.all_overrides)
+    scenario, environment = (
+        possible(plan),
+        environment_file(plan.environment, plan.all_overrides, plan.settings.actions),
+    )
     kept = read(path) if resume else None
     if kept is not None:
         onnx, logs = onnx or kept.onnx, logs or kept.logs
@@ -179,9 +186,12 @@ def train(
     course = kept.course if kept is not None else Course()
     seeds = held_out_seeds(0, plan.settings.evaluation.final_worlds)
     judge = partial(_judge, scenario, threads, report)
+    if kept is None and plan.settings.clone:
+        course.teacher = _best_teacher(scenario, plan.settings, plan.settings.clone.agents, judge)
     if plan.settings.network and plan.settings.clone:
         _judge_drivers(plan, scenario, course, report, judge)
-        cloned = SetTrainer(plan, scenario, plan.settings.clone, threads)
+        clone = plan.settings.clone.model_copy(update={"agent": course.teacher})
+        cloned = SetTrainer(plan, scenario, clone, threads)
         cloned.begin(report.cloning)
         results = judge(cloned.mean_action, out.name, seeds)
         with replacing_folder(out, (*NAMES, environment.name, *environment.code)) as folder:
@@ -189,6 +199,7 @@ def train(
         report.ranked(_ranking(out, course, results, ()))
         return results
     with closing(Trainer(plan, scenario, threads)) as trainer:
+        trainer.teacher = course.teacher
         with new_folder(out), new_folder(logs or out / LOGS) as tensorboard:
             check_file(path)
             trainer.model.set_logger(configure(str(tensorboard), ["tensorboard"]))
@@ -232,6 +243,8 @@ def _notes(trainer: Trainer, course: Course) -> Iterator[str]:
     """Yield what is to be known of a training that did not go on to its end, or whose last policy is not the best."""
     status, settings = trainer.status, trainer.plan.settings
     yield from trainer.notes
+    if settings.clone and len(settings.clone.agents) > 1:
+        yield f"Cloned: {course.teacher}, the best of {len(settings.clone.agents)} agents in the worlds for validation"
     if status.share < 1.0:
         spent = f"{status.steps:,} of {settings.steps:,} steps"
         yield f"Stopped by --minutes {settings.minutes:g} after {spent}: another load gives another agent"
@@ -239,10 +252,23 @@ def _notes(trainer: Trainer, course: Course) -> Iterator[str]:
         yield f"Kept: the policy after {steps:,} steps, the best in the worlds for validation"
 
 
+def _best_teacher(scenario: Scenario, settings: Settings, names: Sequence[str], judge: Judge) -> str:
+    """Return the best of several agents in the worlds for validation."""
+    if len(names) == 1:
+        return names[0]
+    figures = {name: figures_of(judge(load_agent(name, scenario), name, _validation(settings))) for name in names}
+    return min(names, key=lambda name: ranking_key(figures[name]))
+
+
+def _validation(settings: Settings) -> list[int]:
+    """Return the seeds of the worlds that are looked at while learning."""
+    return [evaluation_seed(WHILE_LEARNING + world) for world in range(settings.evaluation.worlds)]
+
+
 def _judge_drivers(plan: TrainingPlan, scenario: Scenario, course: Course, report: Reports, judge: Judge) -> None:
     """Judge the drivers that the policy is ranked among, as far as they can drive."""
     seeds = held_out_seeds(0, plan.settings.evaluation.final_worlds)
-    cloned, able = [plan.settings.clone.agent] if plan.settings.clone else [], list[tuple[str, Policy]]()
+    cloned, able = plan.settings.clone.agents if plan.settings.clone else (), list[tuple[str, Policy]]()
     for name in dict.fromkeys((*cloned, *plan.settings.evaluation.drivers)):
         with suppress(CoopenvError):
             policy = load_agent(name, scenario)
@@ -259,7 +285,7 @@ def _learn(trainer: Trainer, course: Course, report: Reports, judge: Judge, keep
     """
     settings, kept = trainer.plan.settings, trainer.seconds
     evaluation, longest = settings.evaluation, 60.0 * (settings.minutes or np.inf)
-    seeds = [evaluation_seed(WHILE_LEARNING + world) for world in range(evaluation.worlds)]
+    seeds = _validation(settings)
 
     def look() -> None:
         status = trainer.status

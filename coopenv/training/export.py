@@ -18,6 +18,7 @@ from coopenv.base.files import writing
 from coopenv.base.installation import install_command, needing, version, versions
 from coopenv.evaluation import Result
 from coopenv.policies import sets
+from coopenv.policies.choices import STEERING
 from coopenv.policies.loader import AGENT_FILE, NetworkCard
 from coopenv.policies.network import CRITIC, ENTRY, layout_hash, layout_tables
 from coopenv.scenario import Scenario
@@ -82,45 +83,37 @@ def scenario_digest(scenario: Scenario) -> str:
     return sha256(text.encode()).hexdigest()[:16]
 
 
-def _network(trainer: Trainer, digest: str) -> NetworkCard:
-    observation, action = layout_tables(observation_layout(trainer.scenario))
-    settings = settings_of_meaning(trainer.scenario, observation)
+def _network(trainer: Trainer | SetTrainer, digest: str) -> NetworkCard:
+    plan, more = trainer.plan, dict[str, Any]()
+    observation, action, settings = (dict[str, Any]() for _ in range(3))  # a network over sets reads any
+    if isinstance(trainer, SetTrainer):
+        seen = trainer.seen
+    else:
+        observation, action = layout_tables(observation_layout(trainer.scenario))
+        settings = settings_of_meaning(trainer.scenario, observation)
+        fields = {name: slice(f.start, f.stop) for name, f in observation.items()}
+        fields.pop("time_left", None)  # goes on for vehicles that have arrived
+        seen = {name: trainer.env.seen(columns) for name, columns in fields.items()}
+        more = {"right_of_way": plan.settings.right_of_way, "alone": plan.settings.alone}
     return NetworkCard(
         weights=WEIGHTS_FILE,
         sha256=digest,
         layout=layout_hash(observation, action, settings),
-        clip=trainer.plan.settings.ppo.observation_clip,
+        clip=plan.settings.ppo.observation_clip,
         observation=observation,
         action=action,
         settings=settings,
-        seen={
-            name: trainer.env.seen(slice(field.start, field.stop))
-            for name, field in observation.items()
-            if name != "time_left"  # goes on for vehicles that have arrived
-        },
-        right_of_way=trainer.plan.settings.right_of_way,
-        alone=trainer.plan.settings.alone,
+        seen=seen,
+        actions=plan.portable.actions,
+        **more,
     )
 
 
 def _card(trainer: Trainer | SetTrainer, environment: EnvironmentFile, results: Sequence[Result], digest: str) -> str:
-    plan = trainer.plan
-    if isinstance(trainer, SetTrainer):
-        card = NetworkCard(
-            weights=WEIGHTS_FILE,
-            sha256=digest,
-            layout=layout_hash({}, {}, {}),  # it reads any
-            clip=plan.settings.ppo.observation_clip,
-            observation={},
-            action={},
-            settings={},
-            seen=trainer.seen,
-        )
-    else:
-        card = _network(trainer, digest)
+    plan, card = trainer.plan, _network(trainer, digest)
     arm = f", arm {plan.arm}" if plan.arm else ""
     others = [each.environment for each in plan.watched() if each is not plan]
-    begun = f"Clone of {plan.settings.clone.agent}" if plan.settings.clone and plan.settings.steps == 0 else "PPO"
+    begun = f"Clone of {trainer.teacher}" if plan.settings.steps == 0 else "PPO"
     document = {
         "title": f"Learned driver of {'many environments' if others else environment.title}",
         "description": f"{begun}, one policy for all vehicles{arm}, seed {plan.seed}.",
@@ -138,6 +131,7 @@ def _card(trainer: Trainer | SetTrainer, environment: EnvironmentFile, results: 
             "scenario": scenario_digest(trainer.scenario),
             "settings": settings_digest(plan),
             **({"arm": plan.arm} if plan.arm else {}),
+            **({"teacher": trainer.teacher} if trainer.teacher else {}),
             "steps": trainer.status.steps,
             "discount": plan.settings.ppo.discount(trainer.scenario),  # per decision
             "minutes": round(trainer.status.seconds / 60.0, 2),
@@ -183,6 +177,8 @@ def check_onnx(settings: Settings) -> None:
         raise CoopenvError(f"--onnx: not with network = '{settings.network}'")
     if settings.ppo.memory:
         raise CoopenvError("--onnx: not with ppo.memory, a model has no state")
+    if settings.actions != STEERING:
+        raise CoopenvError(f"--onnx: not with actions = '{settings.actions}', whose driver is no network")
     with needing(f"--onnx needs the package onnx: {install_command('onnx')}"):
         import_module("onnx")
 

@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from torch import Tensor, nn
 
-from coopenv.api.trainers.sb3 import ActingRowsBuffer, LeanPpo, TanhPolicy
+from coopenv.api.trainers.sb3 import ActingRowsBuffer, TanhPolicy
 from coopenv.training.batches import NormalisedEnv
 
 
@@ -90,6 +89,9 @@ class SequencesBuffer(ActingRowsBuffer):
 class RememberingPolicy(TanhPolicy):
     """A tanh network for the mean action, one for the value, and a memory that both read; observations have it."""
 
+    buffer: SequencesBuffer
+    """Buffer whose minibatches are evaluated."""
+
     def __init__(self, *arguments: Any, memory: int, **options: Any) -> None:
         """See SB3's `ActorCriticPolicy`; `memory` is the width M."""
         self._width = memory
@@ -113,22 +115,9 @@ class RememberingPolicy(TanhPolicy):
             states.append(self.cell(seen[:, t], states[-1] * going_on[:, t]))
         return torch.stack(states, dim=1)
 
-
-class RememberingPpo(LeanPpo):
-    """PPO along sequences, through whose states derivatives pass back to the memory (Werbos 1990)."""
-
-    policy: RememberingPolicy
-    rollout_buffer: SequencesBuffer
-    passes_back = True
-
-    def _improve(self, rows: RolloutBufferSamples, clip: float) -> dict[str, float]:
-        every, acted, starts = (torch.from_numpy(values) for values in self.rollout_buffer.sequences())
+    def evaluate_actions(self, obs: Any, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """See `TanhPolicy.evaluate_actions`; derivatives pass back along sequences to the memory (Werbos 1990)."""
+        every, acted, starts = (torch.from_numpy(values) for values in self.buffer.sequences())
         with torch.set_grad_enabled(not self.critic_alone):
-            self._states = self.policy.remember(every, starts)[acted]
-        seen = torch.cat([rows.observations[:, : -self._states.shape[1]], self._states.detach()], dim=1)
-        return super()._improve(rows._replace(observations=seen), clip)
-
-    def pass_back(self, slopes: list[Tensor]) -> None:
-        """See `LeanPpo.pass_back`."""
-        if not self.critic_alone:
-            self._states.backward(sum(slopes)[:, -self._states.shape[1] :])
+            states = self.remember(every, starts)[acted]
+        return super().evaluate_actions(torch.cat([obs[:, : -self._width], states], dim=1), actions)

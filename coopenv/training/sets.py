@@ -65,6 +65,7 @@ class SetTrainer:
         """
         torch.set_num_threads(1)
         self.plan, self.scenario, self.clone, self.threads = plan, scenario, clone, threads or 1
+        self.teacher = clone.agents[0]
         self.tensors: dict[str, np.ndarray] = {}
         """The weights, float32."""
         self.seen: dict[str, tuple[float, float]] = {}
@@ -99,11 +100,11 @@ class SetTrainer:
         widths = tuple(rows.shape[-1] for rows in inputs[1:-1])
         network = SetNetwork(alone.shape[1], widths, self.plan.settings.ppo.hidden[0])
 
-        def slopes(rows: torch.Tensor) -> None:
-            *seen, steering = (values[rows] for values in inputs)
-            nn.functional.smooth_l1_loss(network(*seen), steering, beta=0.1).backward()
+        def loss(*columns: torch.Tensor) -> torch.Tensor:
+            *seen, steering = columns
+            return nn.functional.smooth_l1_loss(network(*seen), steering, beta=0.1)
 
-        regress(network.parameters(), len(alone), self.clone, self.plan.seed, slopes, report)
+        regress(network.parameters(), inputs, self.clone, self.plan.seed, loss, report)
         learnt = {name: values.numpy() for name, values in network.state_dict().items()}
         self.tensors = {name: np.asarray(values, dtype=np.float32) for name, values in {**scales, **learnt}.items()}
         self.mean_action = SetDriver(self.scenario, self.tensors)

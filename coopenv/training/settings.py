@@ -27,6 +27,7 @@ from coopenv.base.installation import (
     scenario_path,
 )
 from coopenv.base.sections import NonNegative, Positive, Probability, Section, read_toml, toml_of, validated
+from coopenv.policies.choices import CHOICES, STEERING
 from coopenv.policies.loader import AGENT_FILE, load_agent
 from coopenv.policies.network import RightOfWay
 from coopenv.scenario import Scenario
@@ -97,8 +98,9 @@ class Ppo(Section):
 class Clone(Section):
     """A start from the behaviour of another driver, whose actions and returns are learnt by regression first."""
 
-    agent: str
-    """Agent whose actions and returns are learnt by regression before training: name, folder or `file.py:Class`."""
+    agent: str | Annotated[tuple[str, ...], Field(min_length=1)]
+    """Agent whose actions and returns are learnt by regression before training: name, folder or `file.py:Class`. Of
+    several the best one by the score, in the worlds for evaluation during training."""
     episodes: Count = 64
     """Recorded worlds, one episode each."""
     rounds: Count = 1
@@ -109,9 +111,17 @@ class Clone(Section):
     learning_rate: Positive = 1e-3
     """Learning rate of Adam."""
     noise: NonNegative = 0.1
-    """Standard deviation of noise added to the agent's actions, so that corrections are recorded, too."""
+    """Standard deviation of noise added to the agent's actions, so that corrections are recorded, too; share of letters
+    that are drawn."""
+    smoothing: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
+    """Share of the probability that is spread over all letters (label smoothing), so that the clone explores."""
     elsewhere: tuple[str, ...] | None = None
     """Environments of the demonstrations for a network over sets, in place of the trained one, which is left out."""
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """All agents."""
+        return (self.agent,) if isinstance(self.agent, str) else self.agent
 
 
 class Variation(Section):
@@ -147,6 +157,9 @@ class Settings(Section):
     """Longest time of learning, min; a training that it stops depends on the machine and its load."""
     start: str | None = None
     """Learned agent that the training continues, name or folder, with its critic and normalisation."""
+    actions: Annotated[str, Field(pattern=rf"^({STEERING}|{CHOICES}|.+:\w+)$")] = STEERING
+    """`steering`: an action of the environment every decision; `choices`: letters of `Choices`, or of a subclass by
+    `file.py:Class`, kept for half a second, which stand for decisions in all counts but that of `ppo.gamma`."""
     right_of_way: bool = False
     """Limit the speeds to those at which the driver `look_ahead` gives way, and follow its plans where a vehicle stands
     in the way or the route is too far away."""
@@ -174,6 +187,8 @@ class Settings(Section):
             raise ValueError("start: a training begins as an agent or as a [clone], give one of them")
         if self.steps == 0 and self.ppo.memory:
             raise ValueError("ppo.memory: a clone alone has none, set steps")
+        if self.actions != STEERING and (self.right_of_way or self.network):
+            raise ValueError(f"actions: '{self.actions}' not with right_of_way, which is theirs already, nor network")
         if self.network and self.alone is not None:
             raise ValueError(f"alone: not with network = '{self.network}'")
         if sum(variation.share for variation in self.variations) > 1.0:
@@ -198,6 +213,14 @@ class TrainingPlan:
     def all_overrides(self) -> dict[str, Any]:
         """Every override of the scenario by its dotted key."""
         return {**self.settings.scenario, **(self.overrides or {})}
+
+    @property
+    def portable(self) -> Settings:
+        """The settings with all overrides as they are beside the agent, with references to copies there."""
+        actions = self.settings.actions
+        actions = beside(actions, Path.cwd(), {}) if is_reference(actions) else actions
+        changed = {"scenario": _with_code_beside(self.all_overrides, {}), "actions": actions}
+        return self.settings.model_copy(update=changed)
 
     def watched(self) -> "list[TrainingPlan]":
         """Return the plan in each environment whose worlds are learnt in."""
@@ -308,8 +331,8 @@ def usual_settings(environment: str, overrides: Mapping[str, Any], **changes: An
         settings = settings.model_copy(update={"scenario": {}})
     try:
         scenario = open_simulation(environment, overrides)
-        if settings.clone is not None:
-            load_agent(settings.clone.agent, scenario)
+        for name in settings.clone.agents if settings.clone else ():
+            load_agent(name, scenario)
     except CoopenvError:
         return read_settings(None, None, name, **changes)
     often = min(settings.evaluation.every, max(1, settings.steps // LOOKS))
@@ -377,7 +400,9 @@ class EnvironmentFile(NamedTuple):
     """Files of own terms, by the names of their copies beside it."""
 
 
-def environment_file(environment: str, overrides: Mapping[str, Any] | None = None) -> EnvironmentFile:
+def environment_file(
+    environment: str, overrides: Mapping[str, Any] | None = None, actions: str = STEERING
+) -> EnvironmentFile:
     """Return an environment, by its name or TOML file, as it goes with an agent that learnt with these overrides.
 
     Raises:
@@ -385,6 +410,8 @@ def environment_file(environment: str, overrides: Mapping[str, Any] | None = Non
     """
     code: dict[str, Path] = {}
     _with_code_beside(overrides or {}, code)
+    if is_reference(actions):
+        beside(actions, Path.cwd(), code)
     if environment in list_envs():
         return EnvironmentFile(environment, environment, None, code)
     if is_scene(environment):
@@ -426,8 +453,7 @@ def settings_text(plan: TrainingPlan) -> str:
     """Return the settings of a training, defaults and overrides among them, as TOML."""
     import tomlkit  # of the extra `train`
 
-    values = plan.settings.model_dump(mode="json", exclude_none=True)
-    return tomlkit.dumps({**values, "scenario": _with_code_beside(plan.all_overrides, {})})
+    return tomlkit.dumps(plan.portable.model_dump(mode="json", exclude_none=True))
 
 
 def settings_digest(plan: TrainingPlan) -> str:
@@ -475,7 +501,7 @@ def _says(path: Path, plan: TrainingPlan, environment: EnvironmentFile) -> bool:
         settings = read_settings(path, None, Path(environment.name).stem)
     except CoopenvError:
         return False
-    return settings == plan.settings.model_copy(update={"scenario": _with_code_beside(plan.all_overrides, {})})
+    return settings == plan.portable
 
 
 def _is_the_agents(path: Path) -> bool:

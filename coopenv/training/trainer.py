@@ -1,10 +1,9 @@
 """One training: the batch, Stable-Baselines3's PPO on it, and its progress. Needs the extra `train`."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from time import monotonic, process_time
 from typing import Any
 
@@ -12,20 +11,21 @@ import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from torch import nn
+from torch import Tensor, nn
 
 from coopenv.api.terms.layout import observation_layout
-from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv, LeanPpo, TanhPolicy, differentiate, outputs
-from coopenv.api.vector_env import CooperativeVectorEnv
+from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv, LeanPpo, TanhPolicy, network
 from coopenv.base.errors import CoopenvError
-from coopenv.policies import decide, find_agent, load_agent, restart
+from coopenv.policies import Policy, find_agent, restart
 from coopenv.policies.alone import Alone
-from coopenv.policies.memory import MEMORY, PARTS, Memory
-from coopenv.policies.network import CRITIC, RightOfWay, layout_tables, load_weights
+from coopenv.policies.choices import STEERING, choices_of
+from coopenv.policies.memory import MEMORY, PARTS
+from coopenv.policies.network import CRITIC, NetworkPolicy, RightOfWay, layout_tables, load_weights
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import SETTLED_FROM
+from coopenv.training.actions import Steering, actions_of
 from coopenv.training.batches import APART, LEAST_VARIANCE, Arrays, MixedWorlds, NormalisedEnv
-from coopenv.training.memory import RememberingEnv, RememberingPolicy, RememberingPpo, SequencesBuffer
+from coopenv.training.memory import RememberingEnv, RememberingPolicy, SequencesBuffer
 from coopenv.training.settings import Clone, TrainingPlan
 
 
@@ -119,61 +119,63 @@ def watch(
     seed: int,
     threads: int,
     report: Callable[[str], None],
+    kind: Steering | None = None,
     rule: RightOfWay | None = None,
-    clone: Callable[[np.ndarray], np.ndarray] | None = None,
+    clone: Policy | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return observations (rows, D), the driver's actions (rows, A), discounted returns and vehicles (rows,).
+    """Return observations (rows, D), the driver's actions (rows, A) or letters (rows,), returns and vehicles (rows,).
 
     With a clone, it drives, and the driver's actions are those that it would have taken. Where the rule alone would
     slow the vehicle down as much, the speed is the largest one.
     """
-    env = CooperativeVectorEnv(scenario, "clone", num_worlds=worlds, autoreset="disabled", threads=threads)
-    driver, noise = load_agent(settings.agent, scenario), np.random.default_rng(seed)
+    kind, name, noise = kind or Steering(), settings.agents[0], np.random.default_rng(seed)
+    driver = kind.teacher(name, scenario)
+    env = kind.batch(scenario, "clone", worlds, threads, driver)
     observation, _ = env.reset(seed=seed)
     restart(driver, np.ones(env.num_envs, dtype=bool))
     under_way = np.tile(scenario.acting, worlds)
     steps: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
     while under_way.any():
-        report(f"watching {settings.agent}: {len(steps) / scenario.rates.decision:.0f} of {scenario.horizon:g} s")
-        action = decide(driver, observation, scenario.action_size)
-        tried = action if clone is None else clone(observation)
-        tried = np.clip(tried + settings.noise * noise.standard_normal(action.shape), -1.0, 1.0)
+        now = len(steps) * (kind.choices.kept if kind.choices else 1) / scenario.rates.decision
+        report(f"watching {name}: {now:.0f} of {scenario.horizon:g} s")
+        action = kind.chosen(driver, observation, scenario)
+        tried = action if clone is None else kind.chosen(clone, observation, scenario)
         before, acted = observation, under_way
-        observation, reward, terminated, truncated, _ = env.step(tried.astype(np.float32))
+        observation, reward, terminated, truncated, _ = env.step(kind.perturbed(tried, settings.noise, noise))
         if rule:
             action[rule(before, np.ones_like(action))[:, 0] <= action[:, 0], 0] = 1.0
         steps.append((before, action, np.where(acted, reward, 0.0), acted))
         under_way = acted & ~(terminated | truncated)
     env.close()
-    observations, actions, rewards, acted = (np.stack(column) for column in zip(*steps, strict=True))
+    observations, chosen, rewards, acted = (np.stack(column) for column in zip(*steps, strict=True))
     returns, following = np.zeros_like(rewards), np.zeros(env.num_envs)
     for t in reversed(range(len(rewards))):
         returns[t] = following = rewards[t] + gamma * following
     vehicle = np.nonzero(acted)[1] % len(scenario.vehicles)
-    return observations[acted], actions[acted], returns[acted], vehicle
+    return observations[acted], chosen[acted], returns[acted], vehicle
 
 
 def regress(
     parameters: Iterable[nn.Parameter],
-    count: int,
+    columns: Sequence[Tensor],
     clone: Clone,
     seed: int,
-    slopes: Callable[[torch.Tensor], None],
+    loss: Callable[..., Tensor],
     report: Callable[[str], None],
 ) -> None:
-    """Minimise a loss over `count` recorded rows; `slopes` writes its derivatives, for rows by index, into `grad`."""
+    """Minimise a loss, a function of the recorded columns (rows, ...), over minibatches of rows."""
     optimiser = torch.optim.Adam(parameters, clone.learning_rate)
     shuffle = torch.Generator().manual_seed(seed)
     for epoch in range(clone.epochs):
         optimiser.param_groups[0]["lr"] = clone.learning_rate * (1.0 - epoch / clone.epochs)
-        report(f"learning from {clone.agent}: pass {epoch + 1} of {clone.epochs}")
-        for rows in torch.randperm(count, generator=shuffle).split(BATCH):
+        report(f"learning from {clone.agents[0]}: pass {epoch + 1} of {clone.epochs}")
+        for rows in torch.randperm(len(columns[0]), generator=shuffle).split(BATCH):
             optimiser.zero_grad()
-            slopes(rows)
+            loss(*(values[rows] for values in columns)).backward()
             optimiser.step()
 
 
-def tensors_of(name: str, scenario: Scenario, clip: float) -> Arrays:
+def tensors_of(name: str, scenario: Scenario, clip: float, actions: str = STEERING) -> Arrays:
     """Return the tensors of a learned agent that a training with observations up to `clip` can continue.
 
     Raises:
@@ -182,7 +184,9 @@ def tensors_of(name: str, scenario: Scenario, clip: float) -> Arrays:
     agent, here = find_agent(name), layout_tables(observation_layout(scenario))
     if agent.folder is None or agent.network is None or not agent.network.observation:
         raise CoopenvError(f"start: {name} is no policy that PPO learns; clone.agent begins as any driver")
-    agent.policy(scenario)
+    theirs, ours = choices_of(agent.policy(scenario)), actions_of(actions, scenario).choices
+    if not ours.matches(theirs) if ours else theirs:
+        raise CoopenvError(f"start: {name} chooses other actions than actions = '{actions}': {agent.network.actions}")
     if (agent.network.observation, agent.network.action) != here:
         raise CoopenvError(f"start: {name} was trained with other fields or scales of the observation")
     if agent.network.clip != clip:
@@ -216,20 +220,19 @@ class Trainer:
         self.plan, self.scenario = plan, scenario
         ppo = plan.settings.ppo
         self._scenarios = plan.scenarios(max(1, ppo.vehicles // sum(scenario.acting)))
-        built = partial(CooperativeVectorEnv, autoreset="same_step", arrays="numpy", threads=threads)
-        parts = [
-            CooperativeSB3VecEnv(built(each, plan.environment, num_worlds=count)) for each, count in self._scenarios
-        ]
+        self.actions = actions_of(plan.settings.actions, scenario)
+        batches = [self.actions.batch(each, plan.environment, count, threads) for each, count in self._scenarios]
+        parts = [CooperativeSB3VecEnv(batch) for batch in batches]
         self.rule, rule = (RightOfWay(scenario) if plan.settings.right_of_way else None for _ in range(2))
         self.batch = parts[0] if len(parts) == 1 else MixedWorlds(parts)
         self.env = NormalisedEnv(self.batch, ppo, rule)
         self._rollout = ppo.decisions * self.env.num_envs
         self._share, self.seconds, self.cpu_seconds = 0.0, 0.0, 0.0
-        self.gamma = ppo.discount(scenario)
-        """Discount per decision."""
+        self.gamma = ppo.discount(scenario) ** self.batch.kept
+        """Discount per action."""
         widths = list(ppo.hidden)
         self.remembering = RememberingEnv(self.env, ppo.memory) if ppo.memory else None
-        algorithm, policy, buffer = (RememberingPpo, RememberingPolicy, SequencesBuffer) if ppo.memory else self.kinds
+        algorithm, policy, buffer = (LeanPpo, RememberingPolicy, SequencesBuffer) if ppo.memory else self.kinds
         self.model: Any = algorithm(
             policy,
             self.remembering or self.env,
@@ -255,40 +258,48 @@ class Trainer:
             device="cpu",
         )
         if self.remembering:
-            self.remembering.cell = self.model.policy.cell
+            self.remembering.cell, self.model.policy.buffer = self.model.policy.cell, self.model.rollout_buffer
         self.model.set_logger(Logger(None, []))
         self.env.settled = plan.settings.start is not None or plan.settings.clone is not None
         self.model.critic_alone = self.env.settled and ppo.critic_first > 0.0
         self._watch = Watch(self.batch)
         self.notes: list[str] = []
         """Remarks for the end."""
+        self.teacher = plan.settings.clone.agents[0] if plan.settings.clone else ""
+        """The agent that is cloned."""
 
     def begin(self, report: Callable[[str], None] = lambda line: None) -> None:
         """Begin as an agent or a clone, where settings name one, and start episodes; `report` gets progress lines."""
         start, widths = self.plan.settings.start, self.plan.settings.ppo.hidden
         if start is not None:
-            tensors = tensors_of(start, self.scenario, self.plan.settings.ppo.observation_clip)
+            settings = self.plan.settings
+            tensors = tensors_of(start, self.scenario, settings.ppo.observation_clip, settings.actions)
             try:
                 self.take(tensors)
             except (RuntimeError, KeyError, ValueError) as error:
                 here = f"ppo.hidden = {[*widths]} and ppo.memory = {self.plan.settings.ppo.memory or 'none'}"
                 raise CoopenvError(f"start: {start} has not the widths {here}: {error}") from None
             if find_agent(start).training.get("steps") == 0:  # a clone alone, of which no exploration was learnt
-                nn.init.constant_(self.model.policy.log_std, math.log(self.plan.settings.ppo.initial_std))
+                for values in self.model.policy.spread.values():
+                    nn.init.constant_(values, math.log(settings.ppo.initial_std))
             if COUNTS not in tensors:
                 self.notes.append(f"{start} was saved without a critic: a new one learnt from its episodes")
         if self.plan.settings.clone is not None:
-            self._imitate(self.plan.settings.clone, report)
+            self._imitate(self.plan.settings.clone.model_copy(update={"agent": self.teacher}), report)
         self.env.start()
 
-    @torch.no_grad()
     def _imitate(self, clone: Clone, report: Callable[[str], None]) -> None:
-        """Fit the mean action to a driver's actions, and the value to the discounted rewards that follow.
+        """Fit the policy to a driver's actions, and the value to the discounted rewards that follow.
 
         The observations of the first round are also the first in the statistics for normalisation. Noise is added to
         all actions, so that corrections of deviations are recorded (Laskey et al. 2017).
         """
         env, networks, watched = self.env, self.model.policy.layers(), list[tuple[np.ndarray, ...]]()
+
+        def loss(seen: Tensor, actions: Tensor, values: Tensor) -> Tensor:
+            acting, valued = (network(layers, seen) for layers in networks)
+            return self.actions.loss(acting, actions, clone.smoothing) + nn.functional.mse_loss(valued, values)
+
         for part in range(clone.rounds):
             watched += self._watched(clone, part, report)
             raw, actions, returns, _ = (np.concatenate(column) for column in zip(*watched, strict=True))
@@ -298,9 +309,8 @@ class Trainer:
             observations = torch.from_numpy(self.forgetting(env.normalise(raw)))
             values = (env.reward_scale * returns)[:, None]
             targets = [torch.from_numpy(aims.astype(np.float32)) for aims in (actions, values)]
-            slopes = partial(self._differentiate, observations, targets)
             chosen = (part for layers in networks for layer in layers for part in layer.parameters())
-            regress(chosen, len(observations), clone, self.plan.seed, slopes, report)
+            regress(chosen, (observations, *targets), clone, self.plan.seed, loss, report)
         env.looked_at.append(raw)
 
     def _watched(self, clone: Clone, part: int, report: Callable[[str], None]) -> Iterator[tuple[np.ndarray, ...]]:
@@ -310,17 +320,7 @@ class Trainer:
         for place, (each, count) in enumerate(self._scenarios, part * len(self._scenarios)):
             worlds, start = max(1, clone.episodes * count // all_worlds // clone.rounds), self.plan.seed + APART * place
             rule = RightOfWay(each) if self.rule else None
-            yield watch(each, worlds, clone, self.gamma, start, threads, report, rule, driving)
-
-    def _differentiate(self, observations: torch.Tensor, targets: list[torch.Tensor], rows: torch.Tensor) -> None:
-        """Write the derivatives of the mean squared errors into `grad`.
-
-        Observations are (M, D), normalised, targets (M, A) and (M, 1); `rows` (B,) are the numbers of those that count.
-        """
-        for layers, aims in zip(self.model.policy.layers(), targets, strict=True):
-            found = outputs(layers, observations[rows])
-            excess = found[-1] - aims[rows]
-            differentiate(layers, found, 2.0 / excess.numel() * excess)
+            yield watch(each, worlds, clone, self.gamma, start, threads, report, self.actions, rule, driving)
 
     def update(self) -> Status:
         """Collect one rollout and learn from it.
@@ -405,14 +405,14 @@ class Trainer:
         if COUNTS in tensors:
             env.statistics.count, env.spread.mean, env.spread.var, env.spread.count = map(float, tensors[COUNTS])
 
-    def _parameters(self) -> dict[str, torch.Tensor]:
+    def _parameters(self) -> dict[str, Tensor]:
         """Return the learnt parameters by the names of an agent's weights."""
         networks = zip(("", CRITIC), self.model.policy.layers(), strict=True)
         each = [(f"{prefix}layers.{i}", layer) for prefix, layers in networks for i, layer in enumerate(layers)]
         found = {f"{name}.{part}": getattr(layer, part) for name, layer in each for part in ("weight", "bias")}
         if self.remembering:
             found |= {f"{MEMORY}{part}": getattr(self.remembering.cell, part) for part in PARTS}
-        return {**found, "log_std": self.model.policy.log_std}
+        return {**found, **self.model.policy.spread}
 
     def record(self, figures: dict[str, float]) -> None:
         """Write figures of the mean action on held-out maps for TensorBoard."""
@@ -426,31 +426,19 @@ class Trainer:
         self.env.close()
 
 
-class MeanAction:
-    """The mean action of a trainer's policy, under rules as in a `Network`."""
+class MeanAction(NetworkPolicy):
+    """The mean action, or the most likely letter, of a trainer's policy."""
 
     def __init__(self, trainer: Trainer, *further: Alone) -> None:
         """Take the policy, and rules beside that of the training."""
         self._trainer = trainer
-        self._rules: list[RightOfWay | Alone] = [*([trainer.rule] if trainer.rule else []), *further]
-        self._memory = Memory(trainer.tensors()) if trainer.remembering else None
+        choices = actions_of(trainer.plan.settings.actions, trainer.scenario).choices
+        super().__init__(choices, [*([trainer.rule] if trainer.rule else []), *further], trainer.tensors())
 
-    def reset(self, mask: np.ndarray) -> None:
-        """Begin new episodes in the rows of a mask (rows,), bool."""
-        for part in (*self._rules, *filter(None, [self._memory])):
-            part.reset(mask)
-
-    def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Return actions without exploration, (rows, A), where vehicles observe (rows, D).
-
-        Raises:
-            DivergedError: they are not finite.
-        """
+    def chosen(self, observations: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """See `NetworkPolicy.chosen`. Raises DivergedError: the policy is not finite."""
         trainer = self._trainer
         seen = trainer.env.normalise(observations)
         with trainer.finite():
-            remembered = self._memory(seen) if self._memory else seen
-            actions = np.asarray(trainer.model.predict(remembered, deterministic=True)[0])
-        for rule in self._rules:
-            actions = rule(observations, actions)
-        return actions
+            remembered = self._memory(seen, rows) if self._memory else seen
+            return np.asarray(trainer.model.predict(remembered, deterministic=True)[0])

@@ -145,7 +145,7 @@ def test_mistakes_are_one_line() -> None:
     with pytest.raises(CoopenvError, match="flat observations"):
         ChoiceRows(coopenv.make_vec("lighthouse", num_worlds=1, autoreset="disabled", observation="dict"))
     rows = ChoiceRows(batch())
-    with pytest.raises(CoopenvError, match="call reset"):
+    with pytest.raises(CoopenvError, match=r"ChoiceRows\.step\(\) called before reset\(\)"):
         rows.step(np.zeros(6, dtype=int))
     rows.reset(seed=0)
     for letters in (np.zeros(6), np.full(6, rows.single_action_space.n), np.zeros(5, dtype=int)):

@@ -1,12 +1,10 @@
 """Stable-Baselines3: the batch as a native `VecEnv`, rows (world, vehicle), and a faster PPO. Needs the extra `train`.
 
-PPO has the gradient of its loss in closed form. Loss, minibatches, optimiser and random numbers are those of SB3's
-`PPO`, and so are the results, except for rounding. The update takes less CPU time: no graph is recorded, tanh is
-NumPy's, and on AMD matrices are multiplied by oneDNN.
+PPO has the gradients of its networks in closed form; results are those of SB3's `PPO`, except for rounding. The update
+takes less CPU time: tanh is NumPy's, and on AMD matrices are multiplied by oneDNN.
 """
 
 import copy
-import math
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from functools import cache
@@ -32,7 +30,7 @@ try:
     from stable_baselines3.common.buffers import RolloutBuffer
     from stable_baselines3.common.monitor import Monitor
     from stable_baselines3.common.policies import ActorCriticPolicy
-    from stable_baselines3.common.type_aliases import RolloutBufferSamples, Schedule
+    from stable_baselines3.common.type_aliases import RolloutBufferSamples
     from stable_baselines3.common.utils import explained_variance
     from stable_baselines3.common.vec_env import VecEnv
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
@@ -68,7 +66,8 @@ class CooperativeSB3VecEnv(VecEnv):
     def __init__(self, envs: CooperativeVectorEnv) -> None:
         """Show a batch with the autoreset mode SAME_STEP and NumPy arrays; `make_sb3_vec_env` builds one by name."""
         self.envs = envs
-        self.scenario, self.vehicles = envs.scenario, envs.vehicles
+        batch = envs.unwrapped
+        self.scenario, self.vehicles = batch.scenario, batch.vehicles
         self.render_mode, self.metadata = "rgb_array", envs.metadata
         self.acted = np.zeros(envs.num_envs, dtype=bool)
         """(num_envs,) whether the row's vehicle was under way in the last step, and acts (any, where none does).
@@ -78,19 +77,22 @@ class CooperativeSB3VecEnv(VecEnv):
         self.batch_infos: dict[str, Any] = {}
         """Infos of the last step as `CooperativeVectorEnv` gives them, arrays (num_envs,)."""
         self._recorder = RecordVehicleEpisodes(envs)
-        self._rows = envs.acting if envs.acting.any() else ~envs.acting
-        self._outcomes, self._begin = outcome_words(envs.scenario), time.time()
+        self._driver: Any = getattr(envs, "driver", None)  # of `ChoiceRows`
+        self.kept: int = self._driver.kept if self._driver else 1
+        """Decisions of a step."""
+        self._rows = batch.acting if batch.acting.any() else ~batch.acting
+        self._outcomes, self._begin = outcome_words(batch.scenario), time.time()
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     @property
     def engine(self) -> Engine:
         """The engine of the batch; a copy of a batch builds its own."""
-        return self.envs.engine
+        return self.envs.unwrapped.engine
 
     @property
     def observation_layout(self) -> Layout:
         """Name, slice, unit and scale of every field of an observation row."""
-        return self.envs.observation_layout
+        return self.envs.unwrapped.observation_layout
 
     def reset(self) -> Any:
         """Start a new episode in every world; `seed()` and `set_options()` apply once.
@@ -106,7 +108,8 @@ class CooperativeSB3VecEnv(VecEnv):
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return the state of the next step as arrays, for `set_state`; plug-in observers are not supported."""
-        return {**self.engine.get_state(), "episode_sums": self._recorder.sums.copy()}
+        remembered = {f"driver.{i}": values for i, values in enumerate(self._driver.state if self._driver else ())}
+        return {**self.engine.get_state(), "episode_sums": self._recorder.sums.copy(), **remembered}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> np.ndarray:
         """Continue from a state of `get_state`, and return its observations.
@@ -114,10 +117,13 @@ class CooperativeSB3VecEnv(VecEnv):
         Raises:
             CoopenvError: it does not fit.
         """
-        sums = state["episode_sums"]
+        rest = dict(state)
+        sums = rest.pop("episode_sums")
         if sums.shape != self._recorder.sums.shape or not np.isfinite(sums).all():
             raise CoopenvError(f"sums of episodes: expected finite numbers of shape {self._recorder.sums.shape}")
-        self.engine.set_state({name: values for name, values in state.items() if name != "episode_sums"})
+        if self._driver:
+            self._driver.state = [rest.pop(f"driver.{i}").copy() for i in range(len(self._driver.state))]
+        self.engine.set_state(rest)
         self._recorder.sums[...] = sums
         self._parked = self.engine.view("ended").reshape(-1) != Outcome.UNDER_WAY
         return self.engine.view("observation").reshape(self.num_envs, -1).copy()
@@ -166,7 +172,7 @@ class CooperativeSB3VecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Return one picture, the top view of world 0."""
-        return [self.envs.engine.picture()]
+        return [self.engine.picture()]
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
@@ -277,7 +283,6 @@ class ActingRowsBuffer(RolloutBuffer):
 
 ONEDNN: Any = getattr(torch.ops.mkldnn, "_linear_pointwise", None)  # private to torch
 CPUINFO = Path("/proc/cpuinfo")
-LOG_DENSITY = 0.5 * math.log(2.0 * math.pi)  # of a standard normal number at 0, negated
 
 
 @cache
@@ -298,35 +303,49 @@ def product(rows: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     return nn.functional.linear(rows, weight, bias)
 
 
-def outputs(layers: Sequence[nn.Linear], rows: Tensor) -> list[Tensor]:
-    """Return the inputs (rows, D) of every layer of a tanh network and, last, its output (rows, A)."""
-    found = [rows]
-    for layer in layers:
-        rows = product(rows, layer.weight, layer.bias)
-        if layer is not layers[-1]:
-            np.tanh(rows.numpy(), out=rows.numpy())  # torch's takes ten times as long
-        found.append(rows)
-    return found
+class TanhNetwork(torch.autograd.Function):
+    """A tanh network with derivatives in closed form; `apply` it to its layers, rows (rows, D) and its parameters."""
+
+    @staticmethod
+    def forward(ctx: Any, layers: Sequence[nn.Linear], rows: Tensor, *parameters: Tensor) -> Tensor:
+        """Return the output (rows, A)."""
+        ctx.layers, ctx.inputs = layers, list[Tensor]()
+        for layer in layers:
+            ctx.inputs.append(rows)
+            rows = product(rows, layer.weight, layer.bias)
+            if layer is not layers[-1]:
+                np.tanh(rows.numpy(), out=rows.numpy())  # torch's takes ten times as long
+        return rows
+
+    @staticmethod
+    def backward(ctx: Any, slope: Tensor) -> Any:
+        """Return a loss's derivatives with respect to rows and parameters, from that with respect to the output."""
+        found = list[Tensor]()
+        for layer, inputs in zip(reversed(ctx.layers), reversed(ctx.inputs), strict=True):
+            found += [slope.sum(0), product(slope.t(), inputs.t())]
+            if layer is not ctx.layers[0]:
+                slope = torch.ops.aten.tanh_backward(product(slope, layer.weight.t()), inputs)
+        through = product(slope, ctx.layers[0].weight.t()) if ctx.needs_input_grad[1] else None
+        return None, through, *reversed(found)
 
 
-def differentiate(layers: Sequence[nn.Linear], found: Sequence[Tensor], slope: Tensor, through: bool = False) -> Tensor:
-    """Write a loss's derivatives with respect to the parameters of a tanh network into their `grad`.
-
-    Args:
-        layers: of the network.
-        found: the result of `outputs`.
-        slope: derivative of the loss with respect to the network's output, (rows, A).
-        through: also return the derivative with respect to the network's input, (rows, D).
-    """
-    for layer, inputs in zip(reversed(layers), reversed(found[:-1]), strict=True):
-        layer.weight.grad, layer.bias.grad = product(slope.t(), inputs.t()), slope.sum(0)
-        if layer is not layers[0]:
-            slope = torch.ops.aten.tanh_backward(product(slope, layer.weight.t()), inputs)
-    return product(slope, layers[0].weight.t()) if through else slope
+def network(layers: Sequence[nn.Linear], rows: Tensor) -> Tensor:
+    """Return the output (rows, A) of a tanh network, which can be differentiated."""
+    parameters = (part for layer in layers for part in (layer.weight, layer.bias))
+    output: Tensor = TanhNetwork.apply(layers, rows, *parameters)
+    return output
 
 
 class TanhPolicy(ActorCriticPolicy):
-    """SB3's `MlpPolicy` on the CPU for actions in a box: a tanh network for their mean, and one for the value."""
+    """SB3's `MlpPolicy` on the CPU: a tanh network for the mean action or the logits of letters, one for the value."""
+
+    critic_alone = False
+    """Whether the loss depends on the values alone."""
+
+    @property
+    def spread(self) -> dict[str, nn.Parameter]:
+        """Parameters of the distribution of actions beside the networks', by name."""
+        return {"log_std": self.log_std} if hasattr(self, "log_std") else {}
 
     def layers(self) -> tuple[list[nn.Linear], list[nn.Linear]]:
         """Return the layers of the networks for the mean and for the value."""
@@ -337,87 +356,43 @@ class TanhPolicy(ActorCriticPolicy):
         actor, critic = ([*(part for part in net if isinstance(part, nn.Linear)), end] for net, end in networks)
         return actor, critic
 
+    def _distribution(self, obs: Tensor) -> Any:
+        return self.action_dist.proba_distribution(network(self.layers()[0], obs), *self.spread.values())
+
     @torch.no_grad()
     def forward(self, obs: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Return actions (rows, A), values (rows, 1) and logarithms of the actions' densities (rows,)."""
-        mean = outputs(self.layers()[0], obs)[-1]
-        distribution = self.action_dist.proba_distribution(mean, self.log_std)
+        """Return actions (rows, A) or letters (rows,), values (rows, 1) and logarithms of their densities (rows,)."""
+        distribution = self._distribution(obs)
         actions = distribution.get_actions(deterministic)
         return actions, self.predict_values(obs), distribution.log_prob(actions)
+
+    def evaluate_actions(self, obs: Any, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return values (rows, 1), and logarithms of the actions' densities and entropies (rows,), for the loss."""
+        distribution = self._distribution(obs)
+        log_density, entropy = distribution.log_prob(actions), distribution.entropy()
+        if self.critic_alone:
+            log_density, entropy = log_density.detach(), entropy.detach()
+        return network(self.layers()[1], obs), log_density, entropy
 
     @torch.no_grad()
     def predict_values(self, obs: Any) -> Tensor:
         """Return values, (rows, 1)."""
-        return outputs(self.layers()[1], obs)[-1]
+        return network(self.layers()[1], obs)
 
 
 class LeanPpo(PPO):
-    """SB3's `PPO` for a `TanhPolicy`, without `clip_range_vf`, `target_kl` and `use_sde`."""
+    """SB3's `PPO` for a `TanhPolicy`, whose critic may learn alone."""
 
     policy: TanhPolicy
     rollout_buffer: ActingRowsBuffer
-    clip_range: Schedule
     critic_alone = False
     """Whether the critic alone learns, and the policy stays as it is."""
     explained = 0.0
     """Share of the variance of the last rollout's returns that the critic explained, over rows that acted."""
-    passes_back = False
-    """Whether the loss's derivatives with respect to the networks' inputs are of use."""
 
-    def pass_back(self, slopes: list[Tensor]) -> None:
-        """Take the derivatives with respect to the inputs (rows, D) of each network that learns."""
-
-    @torch.no_grad()
     def train(self) -> None:
         """Learn from the rollout, and log SB3's figures."""
-        self._update_learning_rate(self.policy.optimizer)
-        clip, buffer = self.clip_range(self._current_progress_remaining), self.rollout_buffer
-        passes = [[self._improve(rows, clip) for rows in buffer.get(self.batch_size)] for _ in range(self.n_epochs)]
-        self._n_updates += self.n_epochs
-        steps = [step for steps in passes for step in steps]
-        figures = {name: float(np.mean([step[name] for step in steps])) for name in steps[0]}
-        figures["approx_kl"] = float(np.mean([step["approx_kl"] for step in passes[-1]]))
-        figures["loss"] = steps[-1]["loss"]
+        self.policy.critic_alone, buffer = self.critic_alone, self.rollout_buffer
+        super().train()
         acted = buffer.swap_and_flatten(buffer.acted).flatten()
         self.explained = float(explained_variance(buffer.values.flatten()[acted], buffer.returns.flatten()[acted]))
-        figures["explained_variance"] = float(explained_variance(buffer.values.flatten(), buffer.returns.flatten()))
-        figures["std"] = float(self.policy.log_std.exp().mean())
-        for name, value in {**figures, "clip_range": clip}.items():
-            self.logger.record(f"train/{name}", value)
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-
-    def _improve(self, rows: RolloutBufferSamples, clip: float) -> dict[str, float]:
-        """Take one gradient step on a minibatch; return the figures that SB3 logs of it."""
-        policy, (actor, critic), count = self.policy, self.policy.layers(), len(rows.advantages)
-        advantages, precision = rows.advantages, torch.exp(-policy.log_std)
-        if count > 1:
-            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-        found = outputs(actor, rows.observations)
-        deviation = (rows.actions - found[-1]) * precision
-        change = -(0.5 * deviation**2 + policy.log_std + LOG_DENSITY).sum(1) - rows.old_log_prob
-        ratio = change.exp()
-        gain = torch.minimum(advantages * ratio, advantages * ratio.clamp(1.0 - clip, 1.0 + clip))
-        # Where the clipped ratio, a constant, gives the smaller gain, the loss does not depend on the density.
-        free = torch.where(advantages > 0.0, ratio <= 1.0 + clip, ratio >= 1.0 - clip)
-        slope = (free * advantages * ratio).div_(-count).unsqueeze(1)  # with respect to the logarithm of the density
-        policy.optimizer.zero_grad()
-        slopes = list[Tensor]()
-        if not self.critic_alone:
-            slopes.append(differentiate(actor, found, slope * deviation * precision, self.passes_back))
-            policy.log_std.grad = (slope * (deviation**2 - 1.0)).sum(0).sub_(self.ent_coef)
-        found = outputs(critic, rows.observations)
-        excess = found[-1].squeeze(1) - rows.returns
-        weighted = excess.mul(2.0 * self.vf_coef / count).unsqueeze(1)
-        slopes.append(differentiate(critic, found, weighted, self.passes_back))
-        self.pass_back(slopes)
-        figures = {
-            "policy_gradient_loss": -float(gain.mean()),
-            "value_loss": float(excess.square().mean()),
-            "entropy_loss": -float((policy.log_std + LOG_DENSITY + 0.5).sum()),
-            "clip_fraction": float(((ratio - 1.0).abs() > clip).float().mean()),
-            "approx_kl": float((ratio - 1.0 - change).mean()),
-        }
-        nn.utils.clip_grad_norm_(policy.parameters(), self.max_grad_norm, foreach=True)
-        policy.optimizer.step()
-        weighted = self.ent_coef * figures["entropy_loss"] + self.vf_coef * figures["value_loss"]
-        return {**figures, "loss": figures["policy_gradient_loss"] + weighted}
