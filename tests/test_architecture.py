@@ -118,8 +118,11 @@ CORE_LINES = 48_000
 """Physical lines that the core, without guests, is to have at most; the owner alone raises it."""
 
 
-STILL_ABOVE = 8_639
-"""Lines by which the core exceeds its ceiling: the core grows no further, and this number only falls, to 0."""
+STILL_ABOVE = 8_758
+"""Lines by which the core exceeds its ceiling: the core grows no further, and this number only falls, to 0.
+
+It rose once, for policies that learn letters of an alphabet, to which the owner grants 400 lines.
+"""
 
 
 def core_lines() -> int:

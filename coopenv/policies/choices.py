@@ -5,19 +5,13 @@ with an effect, and a clone of a rule is exact: letters are classes.
 """
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError
-from coopenv.base.installation import absolute_reference
-from coopenv.policies.loader import load_agent
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import Scenario
 
-STEERING, CHOICES = "steering", "choices"
-"""Kinds of actions in settings and cards; another one is an import path of a subclass of `Choices`."""
 KEPT = 0.5
 """Time (s) for which a choice is kept."""
 OFFSETS, PACES = (0.0, 0.4, -0.4), (1.0, 0.5)
@@ -139,20 +133,7 @@ class Choices(RouteFollower):
         return serves, np.arctan2(ahead[:, 1], ahead[:, 0]) + turn, speed
 
 
-def load_choices(actions: str, scenario: Scenario, folder: Path | None = None) -> Choices:
-    """Return the driver of an alphabet: of `choices`, or of a reference to a subclass, from a folder (None: here).
-
-    Raises:
-        CoopenvError: there is no such subclass, or it cannot drive in this scenario.
-    """
-    own = f"{Choices.__module__}:{Choices.__name__}" if actions == CHOICES else absolute_reference(actions, folder)
-    found = choices_of(load_agent(own, scenario))
-    if found is None:
-        raise CoopenvError(f"actions: {actions} is no subclass of {Choices.__module__}.Choices")
-    return found
-
-
 def choices_of(policy: Any) -> Choices | None:
     """Return the driver with the alphabet of a policy that chooses letters, None for others."""
-    found = getattr(policy, CHOICES, policy)
+    found = getattr(policy, "choices", policy)
     return found if isinstance(found, Choices) else None

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 
 Kind = Literal["learned", "scripted", "reference"]
+Actions = Literal["steering", "choices"]
 AGENT_FILE = "agent.toml"
 CARD_FILES = ("card.json", "card.md")  # written beside it by `coopenv evaluate --write-card`
 CHECKPOINT_FILE = "checkpoint.safetensors"  # in its place while an agent is trained
@@ -60,8 +61,8 @@ class NetworkCard(Section):
     """Settings of the scenario, by dotted key, that define the meaning of the entries beside these tables."""
     seen: dict[str, tuple[float, float]] = Field(default={})
     """Between which values nearly all entries of a field lay in training, by its name."""
-    actions: str = "steering"
-    """`choices`, or a reference to a subclass of `Choices`: outputs are logits of its letters."""
+    actions: Actions = "steering"
+    """`choices`: outputs are logits of the letters of `Choices`."""
     right_of_way: bool = False
     """Actions keep to the rule `RightOfWay`."""
     alone: str | None = None

@@ -16,7 +16,7 @@ from safetensors.numpy import load
 from coopenv.api.terms.layout import Layout, observation_layout, settings_of_meaning
 from coopenv.base.errors import AgentWarning, CoopenvError
 from coopenv.policies.alone import Alone
-from coopenv.policies.choices import STEERING, Choices, load_choices
+from coopenv.policies.choices import Choices
 from coopenv.policies.loader import NetworkCard, NetworkColumn
 from coopenv.policies.look_ahead import LookAhead
 from coopenv.policies.memory import MEMORY, PARTS, Memory
@@ -148,7 +148,7 @@ class Network(NetworkPolicy):
         tensors = {name: values for name, values in tensors.items() if not name.startswith(CRITIC)}
         rules: list[RightOfWay | Alone] = [RightOfWay(scenario)] if network.right_of_way else []
         rules += [Alone(scenario, network.alone)] if network.alone is not None else []
-        choices = None if network.actions == STEERING else load_choices(network.actions, scenario, folder)
+        choices = Choices(scenario) if network.actions == "choices" else None
         outputs = len(choices.alphabet) if choices else len(action)
         depth = _depth_of(path, tensors, len(self._columns), outputs, spread=not choices)
         super().__init__(choices, rules, tensors)

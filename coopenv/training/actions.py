@@ -9,7 +9,7 @@ from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.base.errors import CoopenvError
 from coopenv.policies import Policy, decide, load_agent
 from coopenv.policies.choice_rows import ChoiceRows
-from coopenv.policies.choices import STEERING, Choices, choices_of, load_choices
+from coopenv.policies.choices import Choices, choices_of
 from coopenv.scenario import Scenario
 
 
@@ -50,20 +50,23 @@ class Letters(Steering):
 
     choices: Choices
 
-    def __init__(self, name: str, scenario: Scenario) -> None:
-        """Load the driver, see `load_choices`."""
-        self._name, self.choices = name, load_choices(name, scenario)
+    def __init__(self, scenario: Scenario) -> None:
+        """Build the driver. Raises CoopenvError: the observation lacks what it reads."""
+        try:
+            self.choices = Choices(scenario)
+        except ValueError as error:
+            raise CoopenvError(f"actions: choices: {error}") from None
 
     def teacher(self, agent: str, scenario: Scenario) -> Policy:
         """See `Steering.teacher`."""
         policy = super().teacher(agent, scenario)
         if not self.choices.matches(choices_of(policy)):
-            raise CoopenvError(f"clone.agent: {agent} does not choose letters of actions = '{self._name}'")
+            raise CoopenvError(f"clone.agent: {agent} does not choose letters of actions = 'choices'")
         return policy
 
     def batch(self, scenario: Scenario, *options: Any) -> Any:
         """See `Steering.batch`; a teacher drives, and so knows which letters are taken."""
-        driver = choices_of(options[-1]) or load_choices(self._name, scenario)
+        driver = choices_of(options[-1]) or Choices(scenario)
         return ChoiceRows(super().batch(scenario, *options), driver)
 
     def chosen(self, policy: Any, observations: np.ndarray, scenario: Scenario) -> np.ndarray:
@@ -82,5 +85,5 @@ class Letters(Steering):
 
 
 def actions_of(name: str, scenario: Scenario) -> Steering:
-    """Return the actions of settings. Raises CoopenvError: see `load_choices`."""
-    return Steering() if name == STEERING else Letters(name, scenario)
+    """Return the actions of settings. Raises CoopenvError: see `Letters`."""
+    return Letters(scenario) if name == "choices" else Steering()

@@ -169,10 +169,7 @@ def train(
             or something cannot be written; the last checkpoint stays.
     """
     report, path = reports or Reports(), out / CHECKPOINT_FILE
-    scenario, environment = (
-        possible(plan),
-        environment_file(plan.environment, plan.all_overrides, plan.settings.actions),
-    )
+    scenario, environment = possible(plan), environment_file(plan.environment, plan.all_overrides)
     kept = read(path) if resume else None
     if kept is not None:
         onnx, logs = onnx or kept.onnx, logs or kept.logs

@@ -18,7 +18,6 @@ from coopenv.base.files import writing
 from coopenv.base.installation import install_command, needing, version, versions
 from coopenv.evaluation import Result
 from coopenv.policies import sets
-from coopenv.policies.choices import STEERING
 from coopenv.policies.loader import AGENT_FILE, NetworkCard
 from coopenv.policies.network import CRITIC, ENTRY, layout_hash, layout_tables
 from coopenv.scenario import Scenario
@@ -177,8 +176,8 @@ def check_onnx(settings: Settings) -> None:
         raise CoopenvError(f"--onnx: not with network = '{settings.network}'")
     if settings.ppo.memory:
         raise CoopenvError("--onnx: not with ppo.memory, a model has no state")
-    if settings.actions != STEERING:
-        raise CoopenvError(f"--onnx: not with actions = '{settings.actions}', whose driver is no network")
+    if settings.actions == "choices":
+        raise CoopenvError("--onnx: not with actions = 'choices', whose driver is no network")
     with needing(f"--onnx needs the package onnx: {install_command('onnx')}"):
         import_module("onnx")
 

@@ -27,8 +27,7 @@ from coopenv.base.installation import (
     scenario_path,
 )
 from coopenv.base.sections import NonNegative, Positive, Probability, Section, read_toml, toml_of, validated
-from coopenv.policies.choices import CHOICES, STEERING
-from coopenv.policies.loader import AGENT_FILE, load_agent
+from coopenv.policies.loader import AGENT_FILE, Actions, load_agent
 from coopenv.policies.network import RightOfWay
 from coopenv.scenario import Scenario
 from coopenv.scenario.cosimulators import FILES
@@ -157,9 +156,9 @@ class Settings(Section):
     """Longest time of learning, min; a training that it stops depends on the machine and its load."""
     start: str | None = None
     """Learned agent that the training continues, name or folder, with its critic and normalisation."""
-    actions: Annotated[str, Field(pattern=rf"^({STEERING}|{CHOICES}|.+:\w+)$")] = STEERING
-    """`steering`: an action of the environment every decision; `choices`: letters of `Choices`, or of a subclass by
-    `file.py:Class`, kept for half a second, which stand for decisions in all counts but that of `ppo.gamma`."""
+    actions: Actions = "steering"
+    """`steering`: an action of the environment every decision; `choices`: letters of `Choices`, kept for half a second,
+    which stand for decisions in all counts but that of `ppo.gamma`."""
     right_of_way: bool = False
     """Limit the speeds to those at which the driver `look_ahead` gives way, and follow its plans where a vehicle stands
     in the way or the route is too far away."""
@@ -187,8 +186,8 @@ class Settings(Section):
             raise ValueError("start: a training begins as an agent or as a [clone], give one of them")
         if self.steps == 0 and self.ppo.memory:
             raise ValueError("ppo.memory: a clone alone has none, set steps")
-        if self.actions != STEERING and (self.right_of_way or self.network):
-            raise ValueError(f"actions: '{self.actions}' not with right_of_way, which is theirs already, nor network")
+        if self.actions == "choices" and (self.right_of_way or self.network):
+            raise ValueError("actions: choices keep the right of way already, and need no right_of_way and no network")
         if self.network and self.alone is not None:
             raise ValueError(f"alone: not with network = '{self.network}'")
         if sum(variation.share for variation in self.variations) > 1.0:
@@ -217,10 +216,7 @@ class TrainingPlan:
     @property
     def portable(self) -> Settings:
         """The settings with all overrides as they are beside the agent, with references to copies there."""
-        actions = self.settings.actions
-        actions = beside(actions, Path.cwd(), {}) if is_reference(actions) else actions
-        changed = {"scenario": _with_code_beside(self.all_overrides, {}), "actions": actions}
-        return self.settings.model_copy(update=changed)
+        return self.settings.model_copy(update={"scenario": _with_code_beside(self.all_overrides, {})})
 
     def watched(self) -> "list[TrainingPlan]":
         """Return the plan in each environment whose worlds are learnt in."""
@@ -400,9 +396,7 @@ class EnvironmentFile(NamedTuple):
     """Files of own terms, by the names of their copies beside it."""
 
 
-def environment_file(
-    environment: str, overrides: Mapping[str, Any] | None = None, actions: str = STEERING
-) -> EnvironmentFile:
+def environment_file(environment: str, overrides: Mapping[str, Any] | None = None) -> EnvironmentFile:
     """Return an environment, by its name or TOML file, as it goes with an agent that learnt with these overrides.
 
     Raises:
@@ -410,8 +404,6 @@ def environment_file(
     """
     code: dict[str, Path] = {}
     _with_code_beside(overrides or {}, code)
-    if is_reference(actions):
-        beside(actions, Path.cwd(), code)
     if environment in list_envs():
         return EnvironmentFile(environment, environment, None, code)
     if is_scene(environment):

@@ -18,7 +18,8 @@ from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv, Lea
 from coopenv.base.errors import CoopenvError
 from coopenv.policies import Policy, find_agent, restart
 from coopenv.policies.alone import Alone
-from coopenv.policies.choices import STEERING, choices_of
+from coopenv.policies.choices import choices_of
+from coopenv.policies.loader import Actions
 from coopenv.policies.memory import MEMORY, PARTS
 from coopenv.policies.network import CRITIC, NetworkPolicy, RightOfWay, layout_tables, load_weights
 from coopenv.scenario import Scenario
@@ -175,7 +176,7 @@ def regress(
             optimiser.step()
 
 
-def tensors_of(name: str, scenario: Scenario, clip: float, actions: str = STEERING) -> Arrays:
+def tensors_of(name: str, scenario: Scenario, clip: float, actions: Actions = "steering") -> Arrays:
     """Return the tensors of a learned agent that a training with observations up to `clip` can continue.
 
     Raises:

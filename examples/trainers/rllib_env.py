@@ -1,6 +1,6 @@
 """RLlib, new API stack: one world as a `MultiAgentEnv`, or a batch as rows for one policy. Needs the extra `rllib`.
 
-Copy this file and plain_infos.py beside your program; docs/trainers.md has one.
+Copy this file, plain_infos.py and true_ends.py beside your program; docs/trainers.md has one.
 """
 
 from typing import Any
@@ -9,9 +9,9 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorWrapper
 from plain_infos import PlainInfos
+from true_ends import TrueEnds
 
 from coopenv.api.make import make_rows, parallel_env
-from coopenv.api.vector_env import TrueEnds
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command
 

@@ -15,9 +15,10 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from pettingzoo.test import parallel_api_test
 from pettingzoo.utils.wrappers import RecordVideoParallel
 from plain_infos import NUMBERS, PlainInfos
+from true_ends import TrueEnds
 
 import coopenv
-from coopenv.api.vector_env import RecordVehicleEpisodes, TrueEnds
+from coopenv.api.vector_env import RecordVehicleEpisodes
 from tests.helpers.env_suite import first_episodes
 from tests.helpers.four_way import FOUR_WAY
 

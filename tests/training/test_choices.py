@@ -231,27 +231,17 @@ def test_of_several_teachers_the_best_is_cloned_and_named(tmp_path: Path) -> Non
     assert found[0].notes == (f"Cloned: {RULE}, the best of 2 agents in the worlds for validation",)
 
 
-def test_an_alphabet_of_ones_own_goes_with_the_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_teacher_with_other_letters_is_refused(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(OWN)
-    monkeypatch.chdir(tmp_path)
-    evaluation = EvaluationSettings(worlds=2, final_worlds=2, every=192, drivers=())
-    plan = plan_of(actions="own.py:Fewer", steps=192, evaluation=evaluation)
-    train(plan, Path("agent"), threads=1)
-    (tmp_path / "own.py").unlink()
-    monkeypatch.chdir("/")
-    agent = load_agent(tmp_path / "agent", possible(plan_of()))
-    assert len(choices_of(agent).alphabet) == 2
-    further = plan_of(actions="choices", start=str(tmp_path / "agent"))
-    with pytest.raises(CoopenvError, match=r"start: .* chooses other actions than actions = 'choices': own\.py:Fewer"):
-        possible(further)
+    with pytest.raises(CoopenvError, match=r"clone\.agent: .*Fewer does not choose letters of actions = 'choices'"):
+        possible(plan_of(clone=Clone(agent=f"{tmp_path / 'own.py'}:Fewer")))
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"actions": "letters"}, r"actions\n  String should match pattern .*steering|choices"),
-        ({"right_of_way": True}, r"actions: 'choices' not with right_of_way"),
-        ({"actions": "coopenv.policies.look_ahead:LookAhead"}, r"LookAhead is no subclass of .*Choices"),
+        ({"actions": "letters"}, r"actions\n  Input should be 'steering' or 'choices'"),
+        ({"right_of_way": True}, r"actions: choices keep the right of way already"),
         ({"clone": Clone(agent="route_follower")}, r"clone\.agent: route_follower does not choose letters of actions"),
         ({"start": "lighthouse_team"}, r"start: lighthouse_team chooses other actions than actions = 'choices'"),
         ({"actions": "steering", "scenario": {"observation.exclude": ["messages"]}, "alone": "peek"}, "message_mask"),
