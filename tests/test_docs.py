@@ -209,8 +209,11 @@ def test_the_tables_of_terms() -> None:
 
 
 def test_the_settings_of_training(tmp_path: Path) -> None:
-    settings, study = tables("trainers.md")
+    settings, choices, study = tables("trainers.md")
     path = tmp_path / "train.toml"
+    path.write_text(choices, encoding="utf-8")
+    letters = read_settings(path)
+    assert letters.actions == "choices" and letters.clone and (letters.clone.rounds, letters.clone.smoothing) == (3, 0.25)
     path.write_text(settings, encoding="utf-8")
     said = read_settings(path)
     assert (said.steps, said.ppo.hidden, said.clone) == (500_000, (64, 64), Clone(agent="route_follower"))
