@@ -213,10 +213,12 @@ def test_the_settings_of_training(tmp_path: Path) -> None:
     path = tmp_path / "train.toml"
     path.write_text(choices, encoding="utf-8")
     letters = read_settings(path)
-    assert letters.actions == "choices" and letters.clone and (letters.clone.rounds, letters.clone.smoothing) == (3, 0.25)
+    assert (
+        letters.actions == "choices" and letters.clone and (letters.clone.rounds, letters.clone.smoothing) == (3, 0.25)
+    )
     path.write_text(settings, encoding="utf-8")
     said = read_settings(path)
-    assert (said.steps, said.ppo.hidden, said.clone) == (500_000, (64, 64), Clone(agent="route_follower"))
+    assert (said.steps, said.ppo.hidden, said.clone) == (500_000, (64, 64), Clone(agent=("peek", "route_follower")))
     assert read_settings(path, environment="facade").ppo.hidden == (128, 128)
     assert read_settings(path, "plain", "facade").scenario == {"observation.planar": False}
     (tmp_path / "study.toml").write_text(study, encoding="utf-8")
