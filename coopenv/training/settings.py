@@ -155,7 +155,7 @@ class Settings(Section):
     minutes: Positive | None = None
     """Longest time of learning, min; a training that it stops depends on the machine and its load."""
     start: str | None = None
-    """Learned agent that the training continues, name or folder, with its critic and normalisation."""
+    """Learned agent that the training continues, name or folder (from here or the file's), with critic and scaling."""
     actions: Actions = "steering"
     """`steering`: an action of the environment every decision; `choices`: letters of `Choices`, kept for half a second,
     which stand for decisions in all counts but that of `ppo.gamma`."""
@@ -274,6 +274,8 @@ def read_settings(
     """
     where, raw = (str(path), read_toml(path)) if path is not None else ("settings", {})
     raw = _flattened(raw, where)
+    if path is not None and ((begun := path.parent / str(raw.get("start"))) / AGENT_FILE).is_file():
+        raw["start"] = str(begun)
     environments = _tables(raw.pop("environments", {}), f"{where}: environments")
     arms = _tables(raw.pop("arms", {}), f"{where}: arms")
     here = dict(environments.get(environment or "", {}))

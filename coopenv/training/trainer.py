@@ -19,7 +19,6 @@ from coopenv.base.errors import CoopenvError
 from coopenv.policies import Policy, find_agent, restart
 from coopenv.policies.alone import Alone
 from coopenv.policies.choices import choices_of
-from coopenv.policies.loader import Actions
 from coopenv.policies.memory import MEMORY, PARTS
 from coopenv.policies.network import CRITIC, NetworkPolicy, RightOfWay, layout_tables, load_weights
 from coopenv.scenario import Scenario
@@ -176,7 +175,7 @@ def regress(
             optimiser.step()
 
 
-def tensors_of(name: str, scenario: Scenario, clip: float, actions: Actions = "steering") -> Arrays:
+def tensors_of(name: str, scenario: Scenario, clip: float, actions: str = "steering") -> Arrays:
     """Return the tensors of a learned agent that a training with observations up to `clip` can continue.
 
     Raises:
@@ -271,22 +270,21 @@ class Trainer:
 
     def begin(self, report: Callable[[str], None] = lambda line: None) -> None:
         """Begin as an agent or a clone, where settings name one, and start episodes; `report` gets progress lines."""
-        start, widths = self.plan.settings.start, self.plan.settings.ppo.hidden
-        if start is not None:
-            settings = self.plan.settings
+        settings = self.plan.settings
+        if (start := settings.start) is not None:
             tensors = tensors_of(start, self.scenario, settings.ppo.observation_clip, settings.actions)
             try:
                 self.take(tensors)
             except (RuntimeError, KeyError, ValueError) as error:
-                here = f"ppo.hidden = {[*widths]} and ppo.memory = {self.plan.settings.ppo.memory or 'none'}"
+                here = f"ppo.hidden = {[*settings.ppo.hidden]} and ppo.memory = {settings.ppo.memory or 'none'}"
                 raise CoopenvError(f"start: {start} has not the widths {here}: {error}") from None
             if find_agent(start).training.get("steps") == 0:  # a clone alone, of which no exploration was learnt
                 for values in self.model.policy.spread.values():
                     nn.init.constant_(values, math.log(settings.ppo.initial_std))
             if COUNTS not in tensors:
                 self.notes.append(f"{start} was saved without a critic: a new one learnt from its episodes")
-        if self.plan.settings.clone is not None:
-            self._imitate(self.plan.settings.clone.model_copy(update={"agent": self.teacher}), report)
+        if settings.clone is not None:
+            self._imitate(settings.clone.model_copy(update={"agent": self.teacher}), report)
         self.env.start()
 
     def _imitate(self, clone: Clone, report: Callable[[str], None]) -> None:

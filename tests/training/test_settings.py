@@ -102,6 +102,14 @@ def test_a_clone_alone_is_continued_in_small_steps_and_others_as_they_were(tmp_p
     assert learnt == read_settings(path, start="facade_quality", steps=7)
 
 
+def test_an_agent_beside_the_settings_is_their_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = data_directory("agents") / "relay_team"
+    assert read_settings(folder / "train.toml").start == str(folder / "first")
+    monkeypatch.chdir(folder)
+    assert read_settings(Path("train.toml")).start == "first"
+    assert read_settings(Path("train.toml"), start="peek").start == "peek"
+
+
 VARIED = """
 randomised.randomisation.camera_range = [0.5, 2.0]
 variations = [{ share = 0.25, scenario.camera.model = "omnidirectional" }]
