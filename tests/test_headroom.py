@@ -185,7 +185,8 @@ def test_a_team_arrives_as_often_without_radio_as_the_planner_of_one_vehicle(env
     agents = (load_agent(name, scenario) for name in ("look_ahead", f"{environment}_team"))
     alone, team = (drive(Engine(scenario, len(worlds)), agent, worlds).outcome == Outcome.ARRIVED for agent in agents)
     fewer = alone.mean(axis=1) - team.mean(axis=1)
-    least = 0.4 if environment in AHEAD else 0.9  # few measure a landmark there
+    few = {"broken_camera": 0.85, **dict.fromkeys(AHEAD, 0.4)}  # vehicles measure a landmark there, one or none
+    least = few.get(environment, 0.9)
     assert fewer.mean() <= 2.0 * fewer.std(ddof=1) / np.sqrt(len(fewer)) and alone.mean() > least
 
 
