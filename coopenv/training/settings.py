@@ -97,7 +97,7 @@ class Ppo(Section):
 class Clone(Section):
     """A start from the behaviour of another driver, whose actions and returns are learnt by regression first."""
 
-    agent: str | Annotated[tuple[str, ...], Field(min_length=1)]
+    agent: Annotated[tuple[str, ...], Field(min_length=1)] | str
     """Agent whose actions and returns are learnt by regression before training: name, folder or `file.py:Class`. Of
     several the best one by the score, in the worlds for evaluation during training."""
     episodes: Count = 64
